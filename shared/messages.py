@@ -1,0 +1,155 @@
+"""What crosses from one rank to another, and its bytes.
+
+A message is a 24-byte header (magic, protocol version, kind, frame number, payload length) and a payload. Nothing is
+pickled, and no length is believed before it is checked against what has arrived.
+
+=================  ============================  ============================================================
+message            from → to                     payload
+=================  ============================  ============================================================
+``Camera``         coordinator → all             clip_from_world, eye, viewport, near
+``VisibilityBits`` culling → sampling            1 bit a cell, breadth-first, packed (least significant first)
+``RenderPoints``   sampling → render             entries of (offset, range, stride)
+=================  ============================  ============================================================
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+
+from .camera import Camera
+from .errors import MessageError
+
+MAGIC = b"SPLT"
+PROTOCOL_VERSION = 1
+HEADER = struct.Struct("<4sHHQQ")
+_CAMERA = struct.Struct("<16d3d2Id")
+
+RENDER_POINT = np.dtype([("offset", "<u8"), ("range", "<u4"), ("stride", "<u4")])
+"""One entry of a render-points array (thesis Table 5-1, wider): the points offset, offset + stride, … below
+offset + range of the point-array."""
+
+FRAMEBUFFER_EMPTY = np.uint64(0xFFFF_FFFF_FFFF_FFFF)
+"""Framebuffer word of a pixel no point fell on. Otherwise ``depth bits << 32 | colour word``: depth is the float32
+distance along the view axis (positive, so its bits order as integers), and the nearest point wins by integer minimum."""
+
+
+class Kind(IntEnum):
+    """Kind of a message."""
+
+    CAMERA = 1
+    VISIBILITY = 2
+    RENDER_POINTS = 3
+    STATISTICS = 4
+    END = 5
+
+
+@dataclass(frozen=True)
+class VisibilityBits:
+    """Which cells may be seen: frame number and one bit per cell, packed little-endian.
+
+    bits : (ceil(n_cells / 8),) uint8.
+    """
+
+    frame: int
+    n_cells: int
+    bits: np.ndarray
+
+    @classmethod
+    def pack(cls, frame: int, visible: np.ndarray) -> VisibilityBits:
+        """Of an (n_cells,) bool or uint8 array."""
+        return cls(frame, len(visible), np.packbits(visible.view(np.uint8), bitorder="little"))
+
+    def unpack(self) -> np.ndarray:
+        """(n_cells,) uint8 of zeros and ones."""
+        return np.unpackbits(self.bits, count=self.n_cells, bitorder="little")
+
+
+@dataclass(frozen=True)
+class RenderPoints:
+    """Which points to draw: frame number and (m,) ``RENDER_POINT`` entries."""
+
+    frame: int
+    entries: np.ndarray
+
+    @property
+    def n_points(self) -> int:
+        """Number of points the entries draw."""
+        stride = np.maximum(self.entries["stride"].astype(np.int64), 1)
+        return int(((self.entries["range"].astype(np.int64) + stride - 1) // stride).sum())
+
+
+Message = Camera | VisibilityBits | RenderPoints
+
+
+def header(kind: Kind, frame: int, length: int) -> bytes:
+    """The 24 bytes in front of a payload."""
+    return HEADER.pack(MAGIC, PROTOCOL_VERSION, kind, frame, length)
+
+
+def parse_header(data: bytes | memoryview) -> tuple[Kind, int, int]:
+    """(kind, frame, payload length). Raises MessageError for a foreign, newer or cut header."""
+    if len(data) < HEADER.size:
+        raise MessageError(f"message header: found {len(data)} bytes, expected {HEADER.size}")
+    magic, version, kind, frame, length = HEADER.unpack_from(data)
+    if magic != MAGIC:
+        raise MessageError(f"message header: found magic {magic!r}, expected {MAGIC!r}")
+    if version != PROTOCOL_VERSION:
+        raise MessageError(f"message header: found protocol {version}, expected {PROTOCOL_VERSION}")
+    try:
+        return Kind(kind), frame, length
+    except ValueError:
+        raise MessageError(f"message header: found kind {kind}, expected one of {[int(k) for k in Kind]}") from None
+
+
+def encode(message: Message) -> tuple[bytes, memoryview]:
+    """(header, payload) of a message. The payload is a view where the message holds an array: no copy."""
+    match message:
+        case Camera():
+            payload = memoryview(
+                _CAMERA.pack(
+                    *np.asarray(message.clip_from_world, np.float64).ravel(),
+                    *np.asarray(message.eye, np.float64),
+                    message.width,
+                    message.height,
+                    message.near,
+                )
+            )
+            return header(Kind.CAMERA, message.frame, len(payload)), payload
+        case VisibilityBits():
+            payload = memoryview(np.ascontiguousarray(message.bits)).cast("B")
+            return header(Kind.VISIBILITY, message.frame, len(payload)), payload
+        case RenderPoints():
+            payload = memoryview(np.ascontiguousarray(message.entries).view(np.uint8))
+            return header(Kind.RENDER_POINTS, message.frame, len(payload)), payload
+
+
+def decode(kind: Kind, frame: int, payload: bytes | bytearray | memoryview, *, n_cells: int = 0) -> Message:
+    """The message of a payload whose header said ``kind`` and ``frame``; arrays are views of ``payload``.
+
+    n_cells : cells of the scene, needed for visibility bits.
+    Raises MessageError if the payload's length is not what its kind needs.
+    """
+    size = len(payload)
+    match kind:
+        case Kind.CAMERA:
+            _expect(kind, size, _CAMERA.size)
+            v = _CAMERA.unpack(payload)
+            return Camera(frame, np.array(v[:16]).reshape(4, 4), np.array(v[16:19]), v[19], v[20], v[21])
+        case Kind.VISIBILITY:
+            _expect(kind, size, (n_cells + 7) // 8)
+            return VisibilityBits(frame, n_cells, np.frombuffer(payload, np.uint8))
+        case Kind.RENDER_POINTS:
+            if size % RENDER_POINT.itemsize:
+                raise MessageError(f"render-points: found {size} bytes, expected a multiple of 16")
+            return RenderPoints(frame, np.frombuffer(payload, RENDER_POINT))
+        case _:
+            raise MessageError(f"message kind {kind.name} carries no pipeline data")
+
+
+def _expect(kind: Kind, found: int, expected: int) -> None:
+    if found != expected:
+        raise MessageError(f"{kind.name} message: found {found} bytes, expected {expected}")

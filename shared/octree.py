@@ -1,0 +1,87 @@
+"""The sequential octree: cells in breadth-first order in flat arrays (thesis 4.2.2).
+
+Geometry is kept apart from the point-array (thesis 4.2.1): a cell only knows its range there. Octant ``o`` of a
+cell has bit 0 set on the upper half in x, bit 1 in y, bit 2 in z; the Morton ``code`` of a child is
+``parent_code << 3 | o``. Cells of one level stand in ascending code order, so the children of a cell are contiguous.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+MAX_LEVEL = 21
+"""Deepest level: 21 bits an axis fill a 63-bit Morton code."""
+
+
+@dataclass(frozen=True)
+class Octree:
+    """Flat arrays over cells, breadth-first; the root is cell 0.
+
+    origin : (3,) float64, world position of the root cube's lower corner.
+    edge : root cube edge, world units, > 0.
+    level : (n,) uint8, root 0.  code : (n,) uint64, Morton code of the cell at its level.
+    parent : (n,) int32, −1 for the root.
+    first_child : (n,) int32, −1 for a leaf.  n_children : (n,) uint8, 0…8.
+    first_point, n_points : (n,) int64, the cell's contiguous range in the point-array.
+    n_below : (n,) int64, input points inside the cell's cube.
+    cone : (n, 4) float32 or None: unit axis and cosine of the half angle of a cone that holds every normal below the
+        cell; a cosine of −1 means "any direction".
+    point_order : ``layered`` (an inner cell owns its own level-of-detail set, in random order, so any prefix is a
+        fair sample) or ``depth-first`` (points in leaves only, an inner cell's range spans its leaves).
+    """
+
+    origin: np.ndarray
+    edge: float
+    level: np.ndarray
+    code: np.ndarray
+    parent: np.ndarray
+    first_child: np.ndarray
+    n_children: np.ndarray
+    first_point: np.ndarray
+    n_points: np.ndarray
+    n_below: np.ndarray
+    cone: np.ndarray | None
+    point_order: str
+
+    def __len__(self) -> int:
+        return len(self.level)
+
+    @cached_property
+    def is_leaf(self) -> np.ndarray:
+        """(n,) bool."""
+        return self.first_child < 0
+
+    @cached_property
+    def half_edges(self) -> np.ndarray:
+        """(n,) float64: half the edge of each cell's cube, world units."""
+        return np.ldexp(self.edge, -self.level.astype(np.int32) - 1)
+
+    @cached_property
+    def centers(self) -> np.ndarray:
+        """(n, 3) float64: centre of each cell's cube, world frame."""
+        return cell_centers(self.origin, self.edge, self.level, self.code)
+
+
+def compact_bits(code: np.ndarray) -> np.ndarray:
+    """Every third bit of (n,) uint64 Morton codes, gathered: (n,) uint64 below 2**21."""
+    x = code & np.uint64(0x1249249249249249)
+    x = (x ^ (x >> np.uint64(2))) & np.uint64(0x10C30C30C30C30C3)
+    x = (x ^ (x >> np.uint64(4))) & np.uint64(0x100F00F00F00F00F)
+    x = (x ^ (x >> np.uint64(8))) & np.uint64(0x001F0000FF0000FF)
+    x = (x ^ (x >> np.uint64(16))) & np.uint64(0x001F00000000FFFF)
+    return (x ^ (x >> np.uint64(32))) & np.uint64(0x1FFFFF)
+
+
+def cell_coordinates(code: np.ndarray) -> np.ndarray:
+    """(n, 3) int64 grid coordinates, at the code's own level, of (n,) uint64 Morton codes."""
+    code = np.asarray(code, np.uint64)
+    return np.column_stack([compact_bits(code >> np.uint64(axis)) for axis in range(3)]).astype(np.int64)
+
+
+def cell_centers(origin: np.ndarray, edge: float, level: np.ndarray, code: np.ndarray) -> np.ndarray:
+    """(n, 3) float64 world centres of cells given by level and Morton code. Exact up to one rounding an axis."""
+    size = np.ldexp(edge, -np.asarray(level, np.int32))
+    return np.asarray(origin, np.float64) + (cell_coordinates(code) + 0.5) * size[:, None]

@@ -1,0 +1,126 @@
+"""Columns of a point batch, and the packing of colours and normals into words.
+
+A *batch* is what readers yield and the builder takes: float64 world positions and one column per attribute.
+Every attribute column is one-dimensional, so gathering, writing and checking need no special case.
+
+==============  =======  ===================================================================
+column          dtype    meaning
+==============  =======  ===================================================================
+rgb             uint32   colour word ``R | G << 8 | B << 16 | 255 << 24`` (RGBA bytes in memory)
+normal          uint32   unit normal, octahedral, two int16 (``NO_NORMAL``: none)
+intensity       float32  as in the file
+classification  uint8    ASPRS class code
+return_number   uint8    1 = first return
+gps_time        float64  seconds, as in the file
+==============  =======  ===================================================================
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from .errors import InputError
+
+ATTRIBUTES: Mapping[str, np.dtype] = {
+    "rgb": np.dtype("<u4"),
+    "normal": np.dtype("<u4"),
+    "intensity": np.dtype("<f4"),
+    "classification": np.dtype("u1"),
+    "return_number": np.dtype("u1"),
+    "gps_time": np.dtype("<f8"),
+}
+
+NO_NORMAL = np.uint32(0x8000_8000)
+"""Normal word of a point whose normal is absent, zero or not finite (both components −32768)."""
+
+_OCT_MAX = 32767.0
+
+
+@dataclass
+class PointBatch:
+    """Some points in world coordinates.
+
+    positions : (n, 3) float64, metres (or the file's unit), world frame, C-contiguous.
+    attributes : name → (n,) array of ``ATTRIBUTES[name]``.
+
+    Raises InputError from ``check`` if a column has an unknown name, another dtype or another length.
+    """
+
+    positions: np.ndarray
+    attributes: dict[str, np.ndarray] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    def check(self) -> PointBatch:
+        """Return self if every column is as documented, else raise InputError."""
+        if self.positions.ndim != 2 or self.positions.shape[1] != 3 or self.positions.dtype != np.float64:
+            raise InputError(
+                f"positions: found {self.positions.dtype} {self.positions.shape}, expected float64 (n, 3)"
+            )
+        for name, column in self.attributes.items():
+            expected = ATTRIBUTES.get(name)
+            if expected is None:
+                raise InputError(f"attribute {name}: unknown, expected one of {', '.join(ATTRIBUTES)}")
+            if column.dtype != expected or column.shape != (len(self),):
+                raise InputError(
+                    f"attribute {name}: found {column.dtype} {column.shape}, expected {expected} ({len(self)},)"
+                )
+        return self
+
+    def select(self, which: np.ndarray | slice) -> PointBatch:
+        """The points picked by a boolean mask, an index array or a slice."""
+        return PointBatch(self.positions[which], {k: v[which] for k, v in self.attributes.items()})
+
+
+def concatenate(batches: list[PointBatch]) -> PointBatch:
+    """One batch of several that carry the same columns. Cost: one copy."""
+    names = batches[0].attributes.keys()
+    return PointBatch(
+        np.concatenate([b.positions for b in batches]),
+        {k: np.concatenate([b.attributes[k] for b in batches]) for k in names},
+    )
+
+
+def pack_rgb(red: np.ndarray, green: np.ndarray, blue: np.ndarray) -> np.ndarray:
+    """Colour words of three (n,) uint8 channels: (n,) uint32, alpha 255."""
+    words = np.empty((len(red), 4), np.uint8)
+    words[:, 0], words[:, 1], words[:, 2], words[:, 3] = red, green, blue, 255
+    return words.view("<u4").ravel()
+
+
+def unpack_rgb(words: np.ndarray) -> np.ndarray:
+    """(n, 4) uint8 RGBA of (n,) uint32 colour words. A view where the words are contiguous."""
+    return np.ascontiguousarray(words, "<u4").view(np.uint8).reshape(-1, 4)
+
+
+def pack_normals(normals: np.ndarray) -> np.ndarray:
+    """Octahedral words of (n, 3) vectors of any positive length; zero or non-finite ones become ``NO_NORMAL``.
+
+    Error: below 0.004° after ``unpack_normals``. Source: Meyer et al. 2010, "On floating-point normal vectors".
+    """
+    n = np.asarray(normals, np.float64)
+    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+        scale = np.abs(n).max(axis=1)  # first, so that neither huge nor tiny vectors over- or underflow
+        valid = np.isfinite(n).all(axis=1) & (scale > 0)
+        n = np.where(valid[:, None], n, 1.0) / np.where(valid, scale, 1.0)[:, None]
+    n = n / np.abs(n).sum(axis=1, keepdims=True)
+    sign = np.where(n[:, :2] >= 0, 1.0, -1.0)
+    oct_ = np.where((n[:, 2] < 0)[:, None], (1.0 - np.abs(n[:, 1::-1])) * sign, n[:, :2])
+    words = np.rint(oct_ * _OCT_MAX).astype("<i2").view("<u4").ravel()
+    return np.where(valid, words, NO_NORMAL).astype("<u4")
+
+
+def unpack_normals(words: np.ndarray) -> np.ndarray:
+    """(n, 3) float32 unit normals of octahedral words; zero vectors for ``NO_NORMAL``."""
+    words = np.ascontiguousarray(words, "<u4")
+    o = words.view("<i2").reshape(-1, 2).astype(np.float64) / _OCT_MAX
+    n = np.column_stack([o, 1.0 - np.abs(o).sum(axis=1)])
+    sign = np.where(o >= 0, 1.0, -1.0)
+    n[:, :2] = np.where((n[:, 2] < 0)[:, None], (1.0 - np.abs(o[:, ::-1])) * sign, n[:, :2])
+    n /= np.linalg.norm(n, axis=1, keepdims=True)
+    n[words == NO_NORMAL] = 0.0
+    return n.astype(np.float32)

@@ -1,0 +1,1 @@
+"""Readers: files of points → batches of points."""
