@@ -1,0 +1,172 @@
+"""The sampling node: visibility bits in, render-points array out (thesis 4.3.2 and 5.2.1, node 2).
+
+The cut through the octree: a visible cell whose parent was expanded is drawn if it is a leaf or small enough
+on the screen, else it is expanded. Cells are visited in stored (breadth-first) order and the walk ends with
+the last child of an expanded cell, which is the end of the thesis's level-of-detail window.
+
+The projected size of a cell is its edge, in pixels, at the distance from the eye to the nearest point of its
+cube. That distance does not change when the camera only turns, never grows towards a parent, and is at most
+the distance of any point below; so is the size at least that of the edge anywhere in the cube, up to
+perspective stretch off axis.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from ..shared.camera import Camera
+from ..shared.errors import ConfigError, MessageError
+from ..shared.messages import RENDER_POINT, RenderPoints, VisibilityBits
+from ..shared.octree import MAX_LEVEL, Octree
+
+MAX_RANGE = 2**32 - 1
+"""Longest range of one entry; a longer one is split."""
+_EXPANDED = -1
+
+
+class SamplingNode:
+    """Tells which points to draw.
+
+    octree : cells in breadth-first order, either point order.
+    pixel_threshold : a cell that projects to at most this many pixels across is drawn from its own points, if
+        those suffice; 0 draws every visible point.
+    Raises ConfigError for a threshold that is not a finite number ≥ 0.
+    """
+
+    def __init__(self, octree: Octree, *, pixel_threshold: float):
+        if not (pixel_threshold >= 0 and math.isfinite(pixel_threshold)):
+            raise ConfigError(f"sampling.pixel_threshold = {pixel_threshold}, expected a number ≥ 0")
+        self.pixel_threshold = float(pixel_threshold)
+        self._octree = octree
+        self._edge = np.ldexp(octree.edge, -np.arange(MAX_LEVEL + 1))
+        self._stored_order = np.argsort(octree.first_point, kind="stable").astype(np.int32)
+        self._n_drawn = np.empty(len(octree), np.int64)
+        n_stored = int((octree.first_point + octree.n_points).max())
+        self._n_splits = 2 * n_stored // MAX_RANGE  # a piece fills at least half an entry
+
+    def process(self, camera: Camera, bits: VisibilityBits) -> RenderPoints:
+        """The render-points array of one frame, ascending in offset, adjacent ranges merged.
+
+        Every visible leaf has exactly one drawn ancestor-or-self, and nothing invisible is drawn. A drawn
+        cell below the threshold yields at least min(its points, max(1, ⌊N ln N⌋)) of its points, N being the
+        square of its projected size: the head of its range in layered order, every stride-th of the range in
+        depth-first order. A leaf above the threshold yields all its points.
+
+        Raises MessageError if the bits belong to another frame or another octree.
+        Cost: O(cells in the level-of-detail window) plus a scan of one word per cell.
+        """
+        tree = self._octree
+        if bits.frame != camera.frame or bits.n_cells != len(tree):
+            raise MessageError(
+                f"visibility bits: found frame {bits.frame} of {bits.n_cells} cells,"
+                f" expected frame {camera.frame} of {len(tree)}"
+            )
+        n_cut = _cut(
+            tree.centers,
+            tree.level,
+            tree.parent,
+            tree.first_child,
+            tree.n_children,
+            tree.n_points,
+            tree.n_below,
+            self._edge,
+            bits.bits,
+            camera.eye,
+            camera.near,
+            camera.focal_px,
+            self.pixel_threshold,
+            self._n_drawn,
+        )
+        entries = np.empty(n_cut + self._n_splits, RENDER_POINT)
+        strided = tree.point_order == "depth-first"
+        n_entries = _merge(
+            tree.first_point, tree.n_points, self._n_drawn, self._stored_order, strided, MAX_RANGE, entries
+        )
+        return RenderPoints(camera.frame, entries[:n_entries])
+
+
+@njit(nogil=True, cache=True)
+def points_needed(n_pixels):
+    """max(1, ⌊N ln N⌋) as float64: points that, picked at random, cover N pixels (thesis 4.3.2)."""
+    return max(1.0, math.floor(n_pixels * math.log(n_pixels))) if n_pixels > 1.0 else 1.0
+
+
+@njit(nogil=True, cache=True)
+def _cut(
+    centers,
+    level,
+    parent,
+    first_child,
+    n_children,
+    n_points,
+    n_below,
+    edge,
+    bits,
+    eye,
+    near,
+    focal_px,
+    pixel_threshold,
+    n_drawn,
+):
+    """Fill ``n_drawn``: points to draw of a cell of the cut, else 0 or ``_EXPANDED``. Number of cells in
+    it."""
+    n_cut = 0
+    window_end = 1
+    cell = 0
+    while cell < window_end:
+        n_drawn[cell] = 0
+        visible = bits[cell >> 3] >> (cell & 7) & 1
+        if visible and (cell == 0 or n_drawn[parent[cell]] == _EXPANDED):
+            edge_px = edge[level[cell]] * focal_px
+            half = 0.5 * edge[level[cell]]
+            distance_2 = 0.0
+            for axis in range(3):
+                gap = max(0.0, abs(centers[cell, axis] - eye[axis]) - half)
+                distance_2 += gap * gap
+            n_pixels = edge_px * edge_px / max(distance_2, near * near)  # nothing is drawn in front of near
+            is_leaf = first_child[cell] < 0
+            if n_pixels <= pixel_threshold * pixel_threshold:
+                needed = points_needed(n_pixels)
+                if is_leaf or n_points[cell] >= min(needed, n_below[cell]):
+                    n_drawn[cell] = np.int64(min(needed, n_points[cell]))
+            elif is_leaf:
+                n_drawn[cell] = n_points[cell]
+            if n_drawn[cell] > 0:
+                n_cut += 1
+            elif not is_leaf:
+                n_drawn[cell] = _EXPANDED
+                window_end = first_child[cell] + n_children[cell]
+        cell += 1
+    n_drawn[window_end:] = 0
+    return n_cut
+
+
+@njit(nogil=True, cache=True)
+def _merge(first_point, n_points, n_drawn, stored_order, strided, max_range, entries):
+    """Fill ``entries`` from the cut, in stored order. Number of entries."""
+    last = -1
+    end = -1  # where a merged range may go on
+    for cell in stored_order:
+        n = n_drawn[cell]
+        if n <= 0:
+            continue
+        offset = first_point[cell]
+        stride = min(n_points[cell] // n, max_range) if strided else 1
+        left = n_points[cell] if strided else n
+        if stride == 1 and offset == end and entries[last].range + left <= max_range:
+            entries[last].range += left
+            end += left
+            continue
+        while left > 0:
+            piece = min(left, max_range - max_range % stride)  # whole strides, so that the next piece keeps step
+            last += 1
+            entries[last].offset = offset
+            entries[last].range = piece
+            entries[last].stride = stride
+            offset += piece
+            left -= piece
+        end = offset if stride == 1 else -1
+    return last + 1

@@ -1,0 +1,188 @@
+"""Sampling: equal to a plain recursive twin, the cut property, and merged entries that draw the same
+points."""
+
+import math
+
+import numpy as np
+import pytest
+from helpers_octree import build_cloud, leaf_of_points, scenes
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from splatpipe.nodes import sampling
+from splatpipe.nodes.culling import CullingNode
+from splatpipe.nodes.sampling import SamplingNode
+from splatpipe.shared.camera import look_at, perspective_camera
+from splatpipe.shared.errors import ConfigError, MessageError
+from splatpipe.shared.messages import VisibilityBits
+
+EXAMPLES = settings(max_examples=200, derandomize=True, deadline=None)
+THRESHOLDS = st.sampled_from([0.0, 0.7, 3.0, 16.0, 200.0, 1e9])
+
+
+def projected_pixels(octree, camera, cell):
+    """Square of the cell's edge in pixels at the point of its cube nearest to the eye."""
+    half = octree.half_edges[cell]
+    nearest = np.clip(camera.eye, octree.centers[cell] - half, octree.centers[cell] + half)
+    distance = max(np.linalg.norm(nearest - camera.eye), camera.near)
+    return (2 * half * camera.focal_px / distance) ** 2
+
+
+def needed(n_pixels):
+    return max(1, math.floor(n_pixels * math.log(n_pixels)))
+
+
+def cut_twin(octree, camera, visible, threshold):
+    """{cell: points to draw}, by recursion from the root."""
+    drawn = {}
+
+    def visit(cell):
+        if not visible[cell]:
+            return
+        n_pixels = projected_pixels(octree, camera, cell)
+        small = n_pixels <= threshold**2
+        n_points = int(octree.n_points[cell])
+        if octree.is_leaf[cell]:
+            drawn[cell] = min(needed(n_pixels), n_points) if small else n_points
+        elif small and n_points >= min(needed(n_pixels), octree.n_below[cell]):
+            drawn[cell] = min(needed(n_pixels), n_points)
+        else:
+            for child in range(octree.first_child[cell], octree.first_child[cell] + octree.n_children[cell]):
+                visit(child)
+
+    visit(0)
+    return drawn
+
+
+def points_of(octree, cell, n):
+    """Stored indices that a cell of the cut draws."""
+    first, n_points = octree.first_point[cell], octree.n_points[cell]
+    if octree.point_order == "layered":
+        return np.arange(first, first + n)
+    return np.arange(first, first + n_points, n_points // n)
+
+
+def expand(entries):
+    """Stored indices that entries draw, in order."""
+    ranges = [np.arange(e["offset"], e["offset"] + e["range"], e["stride"], dtype=np.int64) for e in entries]
+    return np.concatenate([np.empty(0, np.int64), *ranges])
+
+
+@EXAMPLES
+@given(scenes(), THRESHOLDS)
+def test_draws_exactly_the_points_of_its_twin(scene, threshold):
+    cloud, camera = scene
+    octree = cloud.octree
+    bits = CullingNode(octree, backface=True).process(camera)
+    message = SamplingNode(octree, pixel_threshold=threshold).process(camera, bits)
+    drawn = cut_twin(octree, camera, bits.unpack(), threshold)
+    unmerged = [points_of(octree, cell, n) for cell, n in drawn.items()]
+    np.testing.assert_array_equal(expand(message.entries), np.sort(np.concatenate([np.empty(0, int), *unmerged])))
+    assert message.frame == camera.frame
+    assert message.n_points == sum(map(len, unmerged))
+
+
+@EXAMPLES
+@given(scenes(), THRESHOLDS)
+def test_every_visible_leaf_has_exactly_one_drawn_ancestor_or_self(scene, threshold):
+    cloud, camera = scene
+    octree = cloud.octree
+    bits = CullingNode(octree, backface=False).process(camera)
+    visible = bits.unpack()
+    drawn_points = expand(SamplingNode(octree, pixel_threshold=threshold).process(camera, bits).entries)
+
+    # Who owns a drawn point is read from the entries alone: the cut cell is the one cell of the twin's cut
+    # whose range holds it; layered ranges are disjoint, depth-first ones are nested but a cut takes one of
+    # each branch.
+    drawn = cut_twin(octree, camera, visible, threshold)
+    for cell, n in drawn.items():
+        assert visible[cell]
+        first, n_points = octree.first_point[cell], octree.n_points[cell]
+        mine = drawn_points[(drawn_points >= first) & (drawn_points < first + n_points)]
+        assert n <= len(np.unique(mine)) == len(mine) < 2 * n
+    for leaf in np.flatnonzero(octree.is_leaf & (visible == 1)):
+        line = [leaf]
+        while octree.parent[line[-1]] >= 0:
+            line.append(octree.parent[line[-1]])
+        assert sum(cell in drawn for cell in line) == 1
+
+
+@EXAMPLES
+@given(scenes())
+def test_threshold_zero_draws_every_point_of_every_visible_leaf(scene):
+    cloud, camera = scene
+    bits = CullingNode(cloud.octree, backface=False).process(camera)
+    message = SamplingNode(cloud.octree, pixel_threshold=0.0).process(camera, bits)
+    leaf = leaf_of_points(cloud)
+    expected = np.flatnonzero((leaf >= 0) & (bits.unpack()[leaf] == 1))
+    np.testing.assert_array_equal(expand(message.entries), expected)
+
+
+@EXAMPLES
+@given(scenes(), THRESHOLDS)
+def test_no_two_entries_could_be_one(scene, threshold):
+    cloud, camera = scene
+    bits = CullingNode(cloud.octree, backface=False).process(camera)
+    entries = SamplingNode(cloud.octree, pixel_threshold=threshold).process(camera, bits).entries
+    offset, end = entries["offset"].astype(np.int64), (entries["offset"] + entries["range"]).astype(np.int64)
+    single = entries["stride"] == 1
+    assert (end[:-1] <= offset[1:]).all()
+    assert not (single[:-1] & single[1:] & (end[:-1] == offset[1:])).any()
+
+
+@settings(EXAMPLES, max_examples=60)
+@given(scenes(), THRESHOLDS, st.integers(1, 40))
+def test_ranges_beyond_an_entry_are_split_and_draw_the_same(scene, threshold, max_range):
+    cloud, camera = scene
+    bits = CullingNode(cloud.octree, backface=False).process(camera)
+    whole = SamplingNode(cloud.octree, pixel_threshold=threshold).process(camera, bits)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sampling, "MAX_RANGE", max(max_range, int(whole.entries["stride"].max(initial=1))))
+        split = SamplingNode(cloud.octree, pixel_threshold=threshold).process(camera, bits)
+        assert split.entries["range"].max(initial=0) <= sampling.MAX_RANGE
+    np.testing.assert_array_equal(expand(split.entries), expand(whole.entries))
+
+
+def test_a_far_view_draws_few_points_spread_over_the_whole_cloud():
+    positions = np.random.default_rng(7).uniform(size=(4000, 3))
+    pose = look_at([1000.0, 0.5, 0.5], [0.0, 0.5, 0.5], np.array([0.0, 0.0, 1.0]))
+    camera = perspective_camera(frame=0, world_from_camera=pose, fov_y_rad=0.02, width=300, height=300, near=0.1)
+    for order in ("layered", "depth-first"):
+        cloud = build_cloud(positions, positions, point_order=order, set_points=2000)
+        bits = CullingNode(cloud.octree, backface=False).process(camera)
+        picked = cloud.positions[expand(SamplingNode(cloud.octree, pixel_threshold=20).process(camera, bits).entries)]
+        assert 1000 <= len(picked) < 2400  # N ln N = 1215 for the 15 × 15 pixels of the root
+        octants = np.unique((picked > 0.5) @ [1, 2, 4], return_counts=True)[1]
+        assert len(octants) == 8
+        assert octants.min() > 0.6 * octants.mean()
+
+
+@pytest.fixture
+def small():
+    positions = np.random.default_rng(7).uniform(size=(50, 3))
+    pose = look_at([3.0, 0.5, 0.5], [0.0, 0.5, 0.5], np.array([0.0, 0.0, 1.0]))
+    camera = perspective_camera(frame=4, world_from_camera=pose, fov_y_rad=1.0, width=64, height=64, near=0.1)
+    return build_cloud(positions, positions, point_order="layered").octree, camera
+
+
+@pytest.mark.parametrize("threshold", [-1.0, math.nan, math.inf])
+def test_a_threshold_out_of_range_is_refused(small, threshold):
+    with pytest.raises(ConfigError, match="pixel_threshold"):
+        SamplingNode(small[0], pixel_threshold=threshold)
+
+
+def test_bits_of_another_frame_or_octree_are_refused(small):
+    octree, camera = small
+    node = SamplingNode(octree, pixel_threshold=1.0)
+    for frame, n_cells in [(5, len(octree)), (4, len(octree) + 8)]:
+        with pytest.raises(MessageError, match=f"frame {frame} of {n_cells} cells"):
+            node.process(camera, VisibilityBits.pack(frame, np.ones(n_cells, np.uint8)))
+
+
+def test_messages_do_not_share_memory_with_later_frames(small):
+    octree, camera = small
+    node = SamplingNode(octree, pixel_threshold=0.0)
+    bits = CullingNode(octree, backface=False).process(camera)
+    first = node.process(camera, bits)
+    kept = first.entries.copy()
+    node.process(camera, VisibilityBits.pack(4, np.zeros(len(octree), np.uint8)))
+    np.testing.assert_array_equal(first.entries, kept)
