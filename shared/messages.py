@@ -43,8 +43,8 @@ class Kind(IntEnum):
     CAMERA = 1
     VISIBILITY = 2
     RENDER_POINTS = 3
-    STATISTICS = 4
-    END = 5
+    FRAME_DONE = 4
+    STATISTICS = 5
 
 
 @dataclass(frozen=True)

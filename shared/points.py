@@ -58,9 +58,7 @@ class PointBatch:
     def check(self) -> PointBatch:
         """Return self if every column is as documented, else raise InputError."""
         if self.positions.ndim != 2 or self.positions.shape[1] != 3 or self.positions.dtype != np.float64:
-            raise InputError(
-                f"positions: found {self.positions.dtype} {self.positions.shape}, expected float64 (n, 3)"
-            )
+            raise InputError(f"positions: found {self.positions.dtype} {self.positions.shape}, expected float64 (n, 3)")
         for name, column in self.attributes.items():
             expected = ATTRIBUTES.get(name)
             if expected is None:

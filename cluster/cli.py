@@ -1,0 +1,228 @@
+"""The command line: ``splatpipe COMMAND``.
+
+An error is one line on standard error and an exit status: 2 for bad usage, configuration or input, 1 for a failure
+while running; ``--debug`` shows the traceback. Commands import what they need when they run.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from ..shared.errors import InputError, SplatpipeError
+
+app = typer.Typer(
+    name="splatpipe",
+    help="Point-cloud pictures and flythroughs from machines without a screen.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="markdown",
+)
+bench_app = typer.Typer(help="Measure this machine: rasterizers and the builder, beside others in the same run.")
+app.add_typer(bench_app, name="bench")
+
+JsonOption = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write what was measured.")]
+
+
+@app.callback()
+def _options(
+    debug: Annotated[bool, typer.Option("--debug", help="Show a traceback when something fails.")] = False,
+) -> None:
+    if debug:
+        os.environ["SPLATPIPE_DEBUG"] = "1"
+
+
+@app.command()
+def run(
+    config: Annotated[Path, typer.Argument(help="TOML file; configs/defaults.toml states every key.")],
+    sets: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a key: output.frames=10.")
+    ] = None,
+    json: JsonOption = None,
+) -> None:
+    """Draw a camera path: PNG frames, a film, and run.json with where the time went.
+
+    Starts three MPI ranks by itself where the topology needs them; `mpirun -n 3 splatpipe run …` works as well.
+
+    Example: `splatpipe run city.toml --set camera.width=1920 --set camera.height=1080`
+    """
+    from .run import run_command
+
+    raise typer.Exit(run_command(config, sets or [], json))
+
+
+@app.command()
+def build(
+    inputs: Annotated[list[str], typer.Argument(help="Files, folders or globs: LAS LAZ COPC PLY PCD XYZ CSV NPY E57.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Scene directory to make.")],
+    order: Annotated[str, typer.Option(help="Point order: layered or depth-first.")] = "layered",
+    points_per_cell: Annotated[int, typer.Option(help="A cell with more points is divided.")] = 4096,
+    max_depth: Annotated[int, typer.Option(help="Deepest level of the octree, 0…21.")] = 21,
+    flatness: Annotated[float, typer.Option(help="A cell flatter than this (λ₀ / Σλ) is not divided; 0: off.")] = 0.0,
+    memory: Annotated[str, typer.Option(help="Memory to use, e.g. 4GB; default: half of what is free.")] = "",
+    up: Annotated[str, typer.Option(help="Axis that points up: x, y, z, -x, -y, -z or auto.")] = "auto",
+    attributes: Annotated[str, typer.Option(help="Keep only these, comma separated, e.g. rgb,normal.")] = "",
+    strict: Annotated[bool, typer.Option(help="Refuse points that are not finite instead of dropping them.")] = False,
+    overwrite: Annotated[bool, typer.Option(help="Replace an existing scene.")] = False,
+    json: JsonOption = None,
+) -> None:
+    """Build a scene from point files, larger than memory if need be.
+
+    Example: `splatpipe build 'survey/*.laz' -o survey.scene --memory 8GB`
+    """
+    from ..shared.build import BuildSettings
+    from .scenes import build_command
+
+    settings = BuildSettings(
+        point_order=order,
+        points_per_cell=points_per_cell,
+        max_depth=max_depth,
+        flatness=flatness,
+        memory_bytes=parse_bytes(memory, "--memory") if memory else None,
+        up=up,
+        attributes=tuple(name.strip() for name in attributes.split(",")) if attributes else None,
+        strict=strict,
+        overwrite=overwrite,
+    )
+    build_command(inputs, output, settings, json)
+
+
+@app.command()
+def synth(
+    output: Annotated[Path, typer.Argument(help="Scene directory, or a file ending in .las or .laz.")],
+    points: Annotated[int, typer.Option(help="Number of points.", min=1)] = 2_000_000,
+    seed: Annotated[int, typer.Option(help="Another seed, another city.")] = 1,
+    overwrite: Annotated[bool, typer.Option(help="Replace an existing scene.")] = False,
+) -> None:
+    """Make a synthetic city scan: a scene directory, or a LAS/LAZ file.
+
+    Example: `splatpipe synth city.scene --points 2000000`
+    """
+    from .scenes import synth_command
+
+    synth_command(output, points, seed, overwrite)
+
+
+@app.command()
+def info(
+    scene: Annotated[Path, typer.Argument(help="Scene directory, or a point file.")],
+    json: JsonOption = None,
+) -> None:
+    """Say what a scene or a point file holds.
+
+    Example: `splatpipe info city.scene`
+    """
+    from .scenes import info_command
+
+    info_command(scene, json)
+
+
+@app.command()
+def verify(scene: Annotated[Path, typer.Argument(help="Scene directory.")]) -> None:
+    """Check every checksum, the octree's structure and that each point lies in its cell.
+
+    Example: `splatpipe verify city.scene`
+    """
+    from .scenes import verify_command
+
+    verify_command(scene)
+
+
+@bench_app.command("raster")
+def bench_raster(
+    points: Annotated[int, typer.Option(help="Number of points.", min=1000)] = 4_000_000,
+    size: Annotated[int, typer.Option(help="Width and height, pixels.", min=16, max=8192)] = 1024,
+    repeats: Annotated[int, typer.Option(help="Timed frames of each.", min=3)] = 15,
+    json: JsonOption = None,
+) -> None:
+    """Every rasterizer present, VTK and NumPy on the same points in one run.
+
+    Example: `splatpipe bench raster --json raster.json`
+    """
+    from .bench.raster import bench_raster as measure
+    from .bench.raster import print_raster
+
+    _report(measure(n_points=points, size=size, repeats=repeats), print_raster, json)
+
+
+@bench_app.command("build")
+def bench_build(
+    points: Annotated[int, typer.Option(help="Number of points of the LAS file.", min=1000)] = 20_000_000,
+    repeats: Annotated[int, typer.Option(help="Timed builds.", min=1)] = 3,
+    workdir: Annotated[Path | None, typer.Option(help="Where the file and the scenes go.")] = None,
+    json: JsonOption = None,
+) -> None:
+    """LAS file → scene: points per second and peak memory, in memory and external.
+
+    Example: `splatpipe bench build --points 20000000 --json build.json`
+    """
+    from .bench.build import bench_build as measure
+    from .bench.build import print_build
+
+    _report(measure(n_points=points, repeats=repeats, workdir=workdir), print_build, json)
+
+
+def _report(results: dict[str, Any], show: Any, json: Path | None) -> None:
+    from rich.console import Console
+
+    from ..shared.files import write_json
+
+    show(results, Console())
+    if json is not None:
+        write_json(json, results)
+
+
+def main() -> None:
+    """Entry point of ``splatpipe``: one line and an exit status for whatever goes wrong."""
+    try:
+        app()
+    except SplatpipeError as error:
+        _fail(error, str(error), error.exit_status)
+    except KeyboardInterrupt as error:
+        _fail(error, "interrupted", 130)
+    except MemoryError as error:
+        _fail(error, f"out of memory: {error}", 1)
+    except BrokenPipeError:
+        os._exit(1)  # whoever read us has gone; nothing to say and nowhere to say it
+    except Exception as error:
+        _fail(error, f"internal error: {type(error).__name__}: {error}; --debug shows where", 1)
+
+
+def _fail(error: BaseException, message: str, status: int) -> None:
+    if "SPLATPIPE_DEBUG" in os.environ:
+        import traceback
+
+        traceback.print_exception(error)
+    print("splatpipe: " + " ".join(message.split("\n")), file=sys.stderr)
+    sys.exit(status)
+
+
+def parse_bytes(text: str, option: str) -> int:
+    """Bytes of ``4GB``, ``500 MB``, ``2GiB`` or a plain number. Raises InputError naming the option."""
+    units = {
+        "": 1,
+        "B": 1,
+        "K": 1e3,
+        "KB": 1e3,
+        "M": 1e6,
+        "MB": 1e6,
+        "G": 1e9,
+        "GB": 1e9,
+        "T": 1e12,
+        "TB": 1e12,
+    }
+    units |= {"KIB": 2**10, "MIB": 2**20, "GIB": 2**30, "TIB": 2**40}
+    digits = text.strip().rstrip("BKMGTIbkmgti ")
+    unit = text.strip()[len(digits) :].strip().upper()
+    try:
+        value = float(digits) * units[unit]
+    except (ValueError, KeyError):
+        raise InputError(f"{option} {text}: expected a size such as 500MB or 4GiB") from None
+    if not 0 < value < 2**60:
+        raise InputError(f"{option} {text}: expected a size above 0")
+    return int(value)

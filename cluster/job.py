@@ -1,0 +1,111 @@
+"""One run, made ready: configuration, scene and camera path checked together, the same on every rank."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from ..nodes.culling import CullingNode
+from ..nodes.raster import PointSize
+from ..nodes.render import RenderNode, load_points, make_rasterizer
+from ..nodes.sampling import SamplingNode
+from ..shared.camera import Camera
+from ..shared.camera_path import camera_path
+from ..shared.colour import Colouring, frame_to_rgba, parse_colour
+from ..shared.config import RunConfig
+from ..shared.errors import ConfigError
+from ..shared.messages import RenderPoints
+from ..shared.octree import Octree
+from ..shared.store import Scene
+from .sink import FrameSink, frame_name
+
+
+class Job:
+    """What a run needs to know, checked: anything wrong with configuration or scene is raised here (InputError)."""
+
+    def __init__(self, config: RunConfig) -> None:
+        if not config.scene.path:
+            raise ConfigError("scene.path: missing, expected a scene directory made by splatpipe build")
+        self.config = config
+        self.scene = Scene.open(Path(config.scene.path))
+        info = self.scene.info
+        self.n_frames = config.output.frames
+        self.frames_in_flight = config.pipeline.frames_in_flight
+        self.output = Path(config.output.directory)
+        self.backface = config.culling.backface and "normal" in info.attributes
+        self.pixel_threshold = config.sampling.pixel_threshold
+        render = config.render
+        self.point_size = PointSize(render.point_size_px, render.point_size_world, render.point_size_max_px)
+        self.largest_point_px = render.point_size_max_px if render.point_size_world else render.point_size_px
+        self.background = parse_colour(render.background, "render.background")
+        self.colouring = Colouring.choose(self.scene, render.colour, render.colormap, render.colour_range)
+        self._path = camera_path(config.camera, info, self.n_frames)
+
+    def camera(self, frame: int) -> Camera:
+        """The camera of a frame."""
+        return self._path.camera(frame)
+
+    def culling_node(self, octree: Octree) -> CullingNode:
+        """The culling node of this run."""
+        margin_px = self.largest_point_px / 2 + 0.5  # a point just outside reaches in; and rounding moves it
+        return CullingNode(octree, backface=self.backface, margin_px=margin_px)
+
+    def sampling_node(self, octree: Octree) -> SamplingNode:
+        """The sampling node of this run."""
+        return SamplingNode(octree, pixel_threshold=self.pixel_threshold)
+
+    @contextmanager
+    def open_render(self, progress: Callable[[str, int], None]) -> Iterator[RenderStage]:
+        """The render node of this run with its points loaded, its kernels compiled and its output open."""
+        progress("loading points", 0)
+        points = load_points(self.scene, self.colouring, verify=self.config.scene.verify)
+        render, output = self.config.render, self.config.output
+        camera = self.config.camera
+        with make_rasterizer(
+            render.rasterizer, points, camera.width, camera.height, self.point_size, render.threads or None
+        ) as rasterizer:
+            progress("compiling kernels (kept for the next run)", 0)
+            rasterizer.warm_up()
+            if output.png or output.mp4:
+                with FrameSink(self.output, png=output.png, mp4=output.mp4, fps=output.fps) as sink:
+                    yield RenderStage(RenderNode(rasterizer), sink, self.background)
+            else:
+                yield RenderStage(RenderNode(rasterizer), None, self.background)
+
+    @property
+    def attributes_read(self) -> set[str]:
+        """Attributes of the scene that this run reads."""
+        return {self.colouring.attribute} | ({"normal"} if self.backface else set())
+
+    def outputs(self) -> list[str]:
+        """What the run has written, for people."""
+        output, said = self.config.output, []
+        if output.png:
+            last = frame_name(self.n_frames - 1)
+            said.append(f"{self.output / frame_name(0)} … {last}" if self.n_frames > 1 else str(self.output / last))
+        if output.mp4:
+            said.append(str(self.output / "film.mp4"))
+        return [*said, str(self.output / "run.json")]
+
+
+class RenderStage:
+    """Render node and output of one run."""
+
+    def __init__(self, node: RenderNode, sink: FrameSink | None, background: np.ndarray) -> None:
+        self._node = node
+        self._sink = sink
+        self._background = background
+        self.description = node.description
+
+    def draw(self, camera: Camera, chosen: RenderPoints) -> np.ndarray | None:
+        """The picture, (height, width, 4) uint8; None where nobody wants it (the frame is drawn all the same)."""
+        words = self._node.process(camera, chosen)
+        return frame_to_rgba(words, self._background) if self._sink is not None else None
+
+    def show(self, frame: int, picture: np.ndarray | None) -> None:
+        """Hand the picture to the output; waits while that is behind."""
+        if self._sink is not None and picture is not None:
+            self._sink.put(frame, picture)

@@ -1,0 +1,166 @@
+"""The frame loop: culling → sampling → render, on one rank or on three.
+
+On three ranks frame *i* is drawn while *i + 1* is sampled and *i + 2* culled (thesis 5.2). The coordinator, which is
+also the culling rank, starts a frame only while fewer than ``frames_in_flight`` are unfinished, so nothing piles up.
+Each rank opens only its half of the scene: the selection ranks never load a point, the render rank no octree.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from ..shared.messages import RENDER_POINT, Kind, decode
+from .job import Job
+from .record import StageClock, rank_record, spread_ms
+from .transport import Transport
+
+CULLING, SAMPLING, RENDER = range(3)
+ROLES = ("culling", "sampling", "render")
+_MAX_CAMERA_BYTES = 1 << 10
+
+Progress = Callable[[str, int], None]
+"""Called with what is going on and how many frames are done."""
+
+
+def run_single(job: Job, progress: Progress) -> dict[str, Any]:
+    """All three nodes in this process, frame after frame; the statistics of the run. Imports no MPI."""
+    clocks = [StageClock(role) for role in ROLES]
+    points_drawn: list[int] = []
+    octree = job.scene.octree()
+    culling, sampling = job.culling_node(octree), job.sampling_node(octree)
+    sampling.process(job.camera(0), culling.process(job.camera(0)))  # compiles, or loads what was compiled
+    with job.open_render(progress) as render:
+        started = time.perf_counter()
+        for frame in range(job.n_frames):
+            camera = job.camera(frame)
+            with clocks[CULLING].working():
+                bits = culling.process(camera)
+            with clocks[SAMPLING].working():
+                chosen = sampling.process(camera, bits)
+            with clocks[RENDER].working():
+                picture = render.draw(camera, chosen)
+            with clocks[RENDER].waiting():
+                render.show(frame, picture)
+            points_drawn.append(chosen.n_points)
+            progress("rendering", frame + 1)
+        rendered_s = time.perf_counter() - started
+    return {
+        "rasterizer": render.description,
+        "ranks": [rank_record("single", 0)],
+        "stages": {clock.stage: clock.summary() for clock in clocks},
+        "messages": {},
+        "latency_ms": spread_ms([sum(t) for t in zip(*(clock.work_s for clock in clocks), strict=True)]),
+        "points_drawn": points_drawn,
+        "rendered_s": rendered_s,
+        "finished_s": time.perf_counter() - started,
+    }
+
+
+def run_pipelined(job: Job, transport: Transport, progress: Progress) -> dict[str, Any] | None:
+    """Do this rank's part of the pipeline; the statistics of the run on rank 0, None elsewhere.
+
+    Ranks beyond the third have no part in this topology and only wait for the end. Collective.
+    """
+    match transport.rank:
+        case 0:
+            result = _coordinate(job, transport, progress)
+        case 1:
+            result = _sample(job, transport)
+        case 2:
+            result = _render(job, transport)
+        case _:
+            transport.meet()
+            result = None
+    transport.finish()
+    return result
+
+
+def _coordinate(job: Job, transport: Transport, progress: Progress) -> dict[str, Any]:
+    clock = StageClock("culling")
+    culling = job.culling_node(job.scene.octree())
+    culling.process(job.camera(0))
+    progress("loading the scene", 0)
+    transport.meet()
+    issued_s: list[float] = []
+    latency_s: list[float] = []
+
+    def frame_done() -> None:
+        frame, _ = transport.receive_note(RENDER, Kind.FRAME_DONE)
+        latency_s.append(time.perf_counter() - issued_s[frame])
+        progress("rendering", frame + 1)
+
+    started = time.perf_counter()
+    for frame in range(job.n_frames):
+        with clock.waiting():
+            while frame - len(latency_s) >= job.frames_in_flight or transport.has_note(RENDER, Kind.FRAME_DONE):
+                frame_done()
+        camera = job.camera(frame)
+        issued_s.append(time.perf_counter())
+        for rank in (SAMPLING, RENDER):
+            transport.send(rank, camera)
+        with clock.working():
+            bits = culling.process(camera)
+        transport.send(SAMPLING, bits)
+    while len(latency_s) < job.n_frames:
+        frame_done()
+    rendered_s = time.perf_counter() - started
+    of_sampling, of_render = (transport.receive_note(rank, Kind.STATISTICS)[1] for rank in (SAMPLING, RENDER))
+    ranks = [_statistics(transport, clock), of_sampling, of_render]
+    return {
+        "rasterizer": of_render["rasterizer"],
+        "ranks": [rank["rank"] for rank in ranks],
+        "stages": {rank["stage"]: rank["summary"] for rank in ranks},
+        "messages": {kind: count for rank in ranks for kind, count in rank["messages"].items()},
+        "latency_ms": spread_ms(latency_s),
+        "points_drawn": of_render["points_drawn"],
+        "rendered_s": rendered_s,
+        "finished_s": time.perf_counter() - started,
+    }
+
+
+def _sample(job: Job, transport: Transport) -> None:
+    clock = StageClock("sampling")
+    octree = job.scene.octree()
+    sampling = job.sampling_node(octree)
+    sampling.process(job.camera(0), job.culling_node(octree).process(job.camera(0)))
+    transport.meet()
+    bits_bytes = (len(octree) + 7) // 8
+    for _ in range(job.n_frames):
+        with clock.waiting():
+            camera = decode(*transport.receive(CULLING, Kind.CAMERA, _MAX_CAMERA_BYTES))
+            bits = decode(*transport.receive(CULLING, Kind.VISIBILITY, bits_bytes), n_cells=len(octree))
+        with clock.working():
+            chosen = sampling.process(camera, bits)
+        transport.send(RENDER, chosen)
+    transport.send_note(CULLING, Kind.STATISTICS, job.n_frames, _statistics(transport, clock))
+
+
+def _render(job: Job, transport: Transport) -> None:
+    clock = StageClock("render")
+    points_drawn: list[int] = []
+    chosen_bytes = job.scene.info.n_cells * RENDER_POINT.itemsize
+    with job.open_render(lambda *_: None) as render:
+        transport.meet()
+        for frame in range(job.n_frames):
+            with clock.waiting():
+                camera = decode(*transport.receive(CULLING, Kind.CAMERA, _MAX_CAMERA_BYTES))
+                chosen = decode(*transport.receive(SAMPLING, Kind.RENDER_POINTS, chosen_bytes))
+            with clock.working():
+                picture = render.draw(camera, chosen)
+            with clock.waiting():
+                render.show(frame, picture)
+            points_drawn.append(chosen.n_points)
+            transport.send_note(CULLING, Kind.FRAME_DONE, frame)
+    more = {"points_drawn": points_drawn, "rasterizer": render.description}
+    transport.send_note(CULLING, Kind.STATISTICS, job.n_frames, _statistics(transport, clock) | more)
+
+
+def _statistics(transport: Transport, clock: StageClock) -> dict[str, Any]:
+    return {
+        "stage": clock.stage,
+        "summary": clock.summary(),
+        "rank": rank_record(clock.stage, transport.rank),
+        "messages": transport.traffic(),
+    }

@@ -1,0 +1,92 @@
+"""What a run says about itself: stage times, messages, machine; the content of ``run.json``."""
+
+from __future__ import annotations
+
+import os
+import platform
+import resource
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+RECORD_VERSION = 1
+
+
+class StageClock:
+    """Times of one stage, frame by frame: seconds of work and seconds of waiting for messages or room."""
+
+    def __init__(self, stage: str) -> None:
+        self.stage = stage
+        self.work_s: list[float] = []
+        self.wait_s: list[float] = []
+
+    @contextmanager
+    def working(self) -> Iterator[None]:
+        """Around one frame's work."""
+        start = time.perf_counter()
+        yield
+        self.work_s.append(time.perf_counter() - start)
+
+    @contextmanager
+    def waiting(self) -> Iterator[None]:
+        """Around one frame's wait."""
+        start = time.perf_counter()
+        yield
+        self.wait_s.append(time.perf_counter() - start)
+
+    def summary(self) -> dict[str, Any]:
+        """Median, spread and sum of the work in milliseconds; the sum of waiting in seconds."""
+        return {"work_ms": spread_ms(self.work_s), "work_s": sum(self.work_s), "wait_s": sum(self.wait_s)}
+
+
+def spread_ms(seconds: list[float]) -> dict[str, float]:
+    """Median, minimum, 95th percentile and maximum, in milliseconds; empty for no samples."""
+    if not seconds:
+        return {}
+    values = np.asarray(seconds) * 1e3
+    names = ("median", "min", "p95", "max")
+    return dict(zip(names, (float(v) for v in np.percentile(values, [50, 0, 95, 100])), strict=True))
+
+
+def rank_record(role: str, rank: int) -> dict[str, Any]:
+    """Who this rank is: role, host, process, cores it may use, peak resident memory so far."""
+    return {
+        "rank": rank,
+        "role": role,
+        "host": platform.node(),
+        "pid": os.getpid(),
+        "cores": len(os.sched_getaffinity(0)),
+        "peak_rss_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
+    }
+
+
+def machine_record() -> dict[str, Any]:
+    """The machine and the versions that a figure stands with."""
+    return {
+        "cpu": _cpu_model(),
+        "cores": len(os.sched_getaffinity(0)),
+        "memory_bytes": os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
+        "system": f"{platform.system()} {platform.release()}",
+        "python": platform.python_version(),
+        "versions": {name: _version(name) for name in ("splatpipe", "numpy", "numba", "mpi4py", "moderngl")},
+    }
+
+
+def _cpu_model() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "unknown")
+
+
+def _version(name: str) -> str | None:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None

@@ -1,0 +1,185 @@
+"""``splatpipe run``: from a configuration to pictures, on as many ranks as the topology needs."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from ..shared.config import RunConfig, load_config
+from ..shared.errors import ConfigError, InputError, SplatpipeError
+from ..shared.files import write_json
+from .job import Job
+from .launch import EXPECTED_RANKS, inside_mpi, launch, mpi_available, record
+from .plan import left_out
+from .progress import FrameProgress
+from .record import RECORD_VERSION, machine_record
+from .sink import prepare_output
+
+PIPELINED_RANKS = 3
+
+
+def run_command(config_path: Path, overrides: list[str], json_path: Path | None) -> int:
+    """Draw what a configuration asks for; the exit status. Called by a person, or on each rank by ``mpiexec``."""
+    if inside_mpi():
+        return _run_rank(config_path, overrides, json_path)
+    config = load_config(config_path, overrides)
+    topology = _topology(config)
+    job = Job(config)  # everything that can be wrong with the input is said here, before anything starts
+    prepare_output(job.output)
+    with FrameProgress(config.output.frames) as progress:
+        if topology == "single":
+            from .pipeline import run_single
+
+            summary = _finish(job, "single", run_single(job, progress.show), config_path, json_path)
+        else:
+            summary = _run_ranks(config_path, overrides, json_path, progress)
+    if summary is not None:
+        _tell(summary)
+    return 0 if summary is not None else 1
+
+
+def _topology(config: RunConfig) -> str:
+    wanted = config.pipeline.topology
+    if wanted == "auto":
+        return "pipelined" if mpi_available() else "single"
+    if wanted == "pipelined" and not mpi_available():
+        raise ConfigError("pipeline.topology = 'pipelined': MPI is missing; install splatpipe[mpi] or choose 'single'")
+    return wanted
+
+
+def _run_ranks(
+    config_path: Path, overrides: list[str], json_path: Path | None, progress: FrameProgress
+) -> dict[str, Any] | None:
+    """Start the ranks and show what they report; their summary."""
+    summary: dict[str, Any] = {}
+
+    def on_record(content: dict[str, Any]) -> None:
+        if "summary" in content:
+            summary.update(content["summary"])
+        else:
+            progress.show(content["doing"], content["done"])
+
+    arguments = ["run", str(config_path)]
+    for override in overrides:
+        arguments += ["--set", override]
+    if json_path is not None:
+        arguments += ["--json", str(json_path)]
+    status = launch(arguments, PIPELINED_RANKS, on_record)
+    if status:
+        sys.exit(status)  # the rank that failed has said why
+    return summary
+
+
+def _run_rank(config_path: Path, overrides: list[str], json_path: Path | None) -> int:
+    """Do this rank's part. What is wrong with the input is said once, by rank 0."""
+    from .pipeline import ROLES, run_pipelined, run_single
+    from .transport import Transport
+
+    transport = Transport()
+    role = ROLES[transport.rank] if transport.rank < len(ROLES) else "idle"
+    record(rank=transport.rank, role=role, pid=os.getpid())
+    job: Job | None = None
+    single = False
+    status = 0
+    try:
+        expected = int(os.environ.get(EXPECTED_RANKS, 0))
+        if expected and expected != transport.size:
+            raise InputError(
+                f"mpiexec: found a world of {transport.size} ranks, expected {expected}; "
+                f"it belongs to another MPI than mpi4py's ({transport.library})"
+            )
+        config = load_config(config_path, overrides)
+        transport.timeout_s = config.pipeline.timeout_s
+        single = config.pipeline.topology == "single"
+        needed = 1 if single else PIPELINED_RANKS
+        if transport.size < needed:
+            raise InputError(f"pipeline.topology: found {transport.size} ranks, expected {needed}: mpirun -n {needed}")
+        job = Job(config)
+        if transport.rank == 0:
+            prepare_output(job.output)
+    except SplatpipeError as error:
+        status = error.exit_status
+        if transport.rank == 0:
+            print(f"splatpipe: {error}", file=sys.stderr, flush=True)
+    status = transport.agree(status)
+    if status or job is None:
+        return status
+    try:
+        with FrameProgress(job.n_frames, on_terminal=transport.rank == 0) as progress:
+
+            def show(doing: str, done: int) -> None:
+                record(doing=doing, done=done)
+                progress.show(doing, done)
+
+            if single:
+                result = run_single(job, show) if transport.rank == 0 else None
+                transport.meet()
+            else:
+                result = run_pipelined(job, transport, show)
+        if result is not None:
+            topology = "single" if single else "pipelined"
+            summary = _finish(job, topology, result | {"mpi": transport.library}, config_path, json_path)
+            record(summary=summary)
+            if EXPECTED_RANKS not in os.environ:
+                _tell(summary)
+    except BaseException as error:
+        _abort(transport, role, error)
+    return 0
+
+
+def _abort(transport: Any, role: str, error: BaseException) -> None:
+    """Say which rank failed and why, in one line, and end every rank."""
+    if "SPLATPIPE_DEBUG" in os.environ:
+        import traceback
+
+        traceback.print_exception(error)
+    cause = str(error) if isinstance(error, SplatpipeError) else f"{type(error).__name__}: {error}"
+    print(f"splatpipe: rank {transport.rank} ({role}): {' '.join(cause.split())}", file=sys.stderr, flush=True)
+    time.sleep(0.2)  # so that the line is relayed before mpiexec tears everything down
+    transport.abort(getattr(error, "exit_status", 1))
+
+
+def _finish(
+    job: Job, topology: str, result: dict[str, Any], config_path: Path, json_path: Path | None
+) -> dict[str, Any]:
+    """Write ``run.json`` (last, so that a killed run leaves none); what it holds, less the per-frame lists."""
+    n_frames = job.n_frames
+    content = {
+        "record_version": RECORD_VERSION,
+        "topology": topology,
+        "config_file": config_path.name,
+        "config_sha256": hashlib.sha256(job.config.model_dump_json().encode()).hexdigest(),
+        "config": job.config.model_dump(mode="json"),
+        "scene": {"points": job.scene.info.n_points, "cells": job.scene.info.n_cells},
+        "frames": n_frames,
+        "frames_per_s": n_frames / result["rendered_s"],
+        "seconds": result["finished_s"],
+        **{key: result[key] for key in result if key not in ("rendered_s", "finished_s")},
+        "output": job.outputs(),
+        "left_out": left_out(job, topology, result["rasterizer"]),
+        "machine": machine_record(),
+    }
+    for path in filter(None, (job.output / "run.json", json_path)):
+        write_json(path, content)
+    return content
+
+
+def _tell(summary: dict[str, Any]) -> None:
+    console = Console(highlight=False, soft_wrap=True)
+    stages = ", ".join(f"{name} {stage['work_ms']['median']:.1f} ms" for name, stage in summary["stages"].items())
+    console.print(
+        f"{summary['frames']} frames, {summary['frames_per_s']:.1f} frames/s, {summary['topology']}, "
+        f"{summary['rasterizer']}; median {stages}"
+    )
+    for path in summary["output"]:
+        console.print(f"  wrote {path}")
+    if summary["left_out"]:
+        console.print("left out, because this run does not need it:")
+    for item in summary["left_out"]:
+        console.print(f"  {item['what']}: {item['why']}")

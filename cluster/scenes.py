@@ -1,0 +1,104 @@
+"""The commands that make and examine scenes: build, synth, info, verify."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from ..shared.build import BuildReport, BuildSettings, build_scene
+from ..shared.errors import InputError
+from ..shared.files import write_json
+from ..shared.readers import expand_inputs, open_source
+from ..shared.store import Scene
+from .progress import FrameProgress
+
+_console = Console(highlight=False, soft_wrap=True)
+
+
+def build_command(inputs: list[str], output: Path, settings: BuildSettings, json: Path | None) -> None:
+    """``splatpipe build``."""
+    _build([open_source(path) for path in expand_inputs(inputs)], output, settings, json)
+
+
+def synth_command(output: Path, n_points: int, seed: int, overwrite: bool) -> None:
+    """``splatpipe synth``: a scene, or a file where the name ends in .las or .laz."""
+    from ..shared.synth import CityScan, write_las
+
+    city = CityScan(n_points=n_points, seed=seed)
+    if output.suffix.lower() in (".las", ".laz"):
+        if output.exists() and not overwrite:
+            raise InputError(f"{output}: exists already; --overwrite replaces it")
+        write_las(city, output)
+        _console.print(f"wrote {output}: {n_points:,} points")
+    else:
+        _build([city], output, BuildSettings(overwrite=overwrite, up="z"), None)
+
+
+def _build(sources: list[Any], output: Path, settings: BuildSettings, json: Path | None) -> None:
+    started = time.perf_counter()
+    with FrameProgress(None) as progress:
+        report = build_scene(sources, output, settings=settings, progress=progress.show)
+    seconds = time.perf_counter() - started
+    _tell_build(output, report, seconds)
+    if json is not None:
+        write_json(json, {"seconds": seconds, "points": report.n_points, **report.as_dict()})
+
+
+def _tell_build(output: Path, report: BuildReport, seconds: float) -> None:
+    _console.print(
+        f"wrote {output}: {report.n_points:,} points, {report.n_cells:,} cells, "
+        f"{seconds:.1f} s, {report.n_points / seconds / 1e6:.1f} M points/s"
+    )
+    if report.n_dropped:
+        _console.print(f"  dropped {report.n_dropped:,} points with coordinates that are not finite")
+    for name in report.dropped_attributes:
+        _console.print(f"  left out attribute {name}: not in every input")
+
+
+def info_command(path: Path, json: Path | None) -> None:
+    """``splatpipe info``: of a scene directory or of a point file."""
+    content = _scene_info(path) if path.is_dir() else _file_info(path)
+    table = Table(show_header=False, box=None)
+    for key, value in content.items():
+        table.add_row(key.replace("_", " "), _text(value))
+    _console.print(table)
+    if json is not None:
+        write_json(json, content)
+
+
+def verify_command(path: Path) -> None:
+    """``splatpipe verify``."""
+    scene = Scene.open(path)
+    with FrameProgress(None) as progress:
+        scene.verify(progress=progress.show)
+    _console.print(f"{path}: whole; {scene.info.n_points:,} points in {scene.info.n_cells:,} cells")
+
+
+def _scene_info(path: Path) -> dict[str, Any]:
+    return {"scene": str(path)} | Scene.open(path).info.as_dict()
+
+
+def _file_info(path: Path) -> dict[str, Any]:
+    info = open_source(path).info
+    return {
+        "file": str(path),
+        "format": info.format,
+        "points": info.n_points,
+        "lower": None if info.lower is None else info.lower.tolist(),
+        "upper": None if info.upper is None else info.upper.tolist(),
+        "attributes": list(info.attributes),
+        "crs": info.crs,
+    }
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, int) and not isinstance(value, bool):
+        return f"{value:,}"
+    if isinstance(value, list | tuple):
+        return ", ".join(_text(item) for item in value)
+    text = "unknown" if value is None else str(value)
+    return text if len(text) <= 200 else text[:200] + " …"

@@ -1,0 +1,155 @@
+"""Messages between ranks: the only module that imports mpi4py.
+
+Sends do not block; a receive polls and sleeps, because under MPICH a blocked receive spins and takes the core from the
+ranks that work (measured: two working ranks of four on two cores lost half their speed). A payload above
+``PIECE_BYTES`` goes in pieces: one MPI library fails on a single message above 2 GiB.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections import defaultdict, deque
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..shared.errors import DeviceError, MessageError, SplatpipeError
+from ..shared.messages import HEADER, Kind, Message, encode, header, parse_header
+
+PIECE_BYTES = 1 << 30
+MAX_STATISTICS_BYTES = 64 << 20
+_SPINS = 50
+_SLEEP_S = 100e-6
+
+
+class Received(NamedTuple):
+    """A message as it arrived: kind, frame number and payload bytes."""
+
+    kind: Kind
+    frame: int
+    payload: memoryview
+
+
+class Transport:
+    """Point-to-point messages over a private communicator of COMM_WORLD.
+
+    depth : messages to one rank that may be under way before ``send`` waits (double-buffered: 2).
+    timeout_s : longest wait in ``receive`` and ``send``; then SplatpipeError naming the rank waited for.
+    """
+
+    def __init__(self, timeout_s: float = 300.0, depth: int = 2, piece_bytes: int = PIECE_BYTES) -> None:
+        try:
+            from mpi4py import MPI
+        except (ImportError, RuntimeError) as error:
+            raise DeviceError(f"MPI: {str(error).splitlines()[0]}; install splatpipe[mpi]") from None
+        self._mpi = MPI
+        self._comm = MPI.COMM_WORLD.Dup()
+        self.rank: int = self._comm.Get_rank()
+        self.size: int = self._comm.Get_size()
+        self.library = MPI.Get_library_version().splitlines()[0].strip("\0 ")
+        self.timeout_s = timeout_s
+        self._depth = depth
+        self._piece_bytes = piece_bytes
+        self._under_way: dict[int, deque[tuple[list[Any], Any]]] = defaultdict(deque)
+        self._bytes: dict[str, int] = defaultdict(int)
+        self._count: dict[str, int] = defaultdict(int)
+
+    def send(self, dest: int, message: Message) -> None:
+        """Start sending a message, whose arrays must not change any more. Waits while ``depth`` are under way."""
+        self._post(dest, *encode(message))
+
+    def send_note(self, dest: int, kind: Kind, frame: int, note: dict[str, Any] | None = None) -> None:
+        """Start sending a small note as JSON: frame finished, statistics at the end."""
+        payload = memoryview(json.dumps(note).encode() if note is not None else b"")
+        self._post(dest, header(kind, frame, len(payload)), payload)
+
+    def receive(self, source: int, expected: Kind, max_bytes: int) -> Received:
+        """The next message of kind ``expected`` from a rank; polite while it waits.
+
+        Raises MessageError for a foreign header or a payload above ``max_bytes`` (nothing is allocated for it),
+        SplatpipeError after ``timeout_s``.
+        """
+        head = bytearray(HEADER.size)
+        self._wait([self._comm.Irecv([head, self._mpi.BYTE], source, int(expected))], source, expected.name)
+        kind, frame, length = parse_header(bytes(head))
+        if kind is not expected:
+            raise MessageError(f"from rank {source}: found {kind.name}, expected {expected.name}")
+        if length > max_bytes:
+            raise MessageError(f"{kind.name} from rank {source}: found {length} bytes, expected at most {max_bytes}")
+        payload = np.empty(length, np.uint8)
+        requests = [self._comm.Irecv([piece, self._mpi.BYTE], source, int(expected)) for piece in self._pieces(payload)]
+        self._wait(requests, source, expected.name)
+        return Received(kind, frame, payload.data)
+
+    def receive_note(self, source: int, expected: Kind) -> tuple[int, dict[str, Any]]:
+        """(frame, note) of the next note of a kind. Raises MessageError if it is not a JSON object."""
+        received = self.receive(source, expected, MAX_STATISTICS_BYTES)
+        try:
+            note = json.loads(bytes(received.payload) or b"{}")
+        except ValueError:
+            note = None
+        if not isinstance(note, dict):
+            raise MessageError(f"{expected.name} from rank {source}: expected a JSON object")
+        return received.frame, note
+
+    def has_note(self, source: int, kind: Kind) -> bool:
+        """Whether a message of a kind waits to be received. Cost: one probe."""
+        return bool(self._comm.Iprobe(source, int(kind)))
+
+    def agree(self, status: int) -> int:
+        """The highest status of all ranks. Collective."""
+        return int(self._comm.allreduce(status, op=self._mpi.MAX))
+
+    def traffic(self) -> dict[str, dict[str, int]]:
+        """Messages and bytes (headers included) this rank has sent, by kind."""
+        return {kind: {"count": self._count[kind], "bytes": n} for kind, n in self._bytes.items()}
+
+    def meet(self) -> None:
+        """Wait, however long it takes, until every rank is here: loading a scene has no time limit. Collective."""
+        request = self._comm.Ibarrier()
+        while not request.Test():
+            time.sleep(_SLEEP_S)
+
+    def finish(self) -> None:
+        """Wait until everything sent has gone and every rank is here. Collective."""
+        for dest in list(self._under_way):
+            self._drain(dest, 0)
+        self.meet()
+
+    def abort(self, status: int) -> None:
+        """End every rank of the run with an exit status."""
+        self._comm.Abort(status)
+
+    def _post(self, dest: int, head: bytes, payload: memoryview) -> None:
+        kind = parse_header(head)[0]
+        self._drain(dest, self._depth - 1)
+        body = np.frombuffer(payload, np.uint8)
+        tag = int(kind)
+        requests = [self._comm.Isend([head, self._mpi.BYTE], dest, tag)]
+        requests += [self._comm.Isend([piece, self._mpi.BYTE], dest, tag) for piece in self._pieces(body)]
+        self._under_way[dest].append((requests, (head, payload)))
+        self._bytes[kind.name] += len(head) + len(payload)
+        self._count[kind.name] += 1
+
+    def _pieces(self, body: np.ndarray) -> list[np.ndarray]:
+        return [body[i : i + self._piece_bytes] for i in range(0, len(body), self._piece_bytes)]
+
+    def _drain(self, dest: int, at_most: int) -> None:
+        queue = self._under_way[dest]
+        while queue and self._mpi.Request.Testall(queue[0][0]):
+            queue.popleft()
+        while len(queue) > at_most:
+            self._wait(queue[0][0], dest, "a message sent to it to be taken")
+            queue.popleft()
+
+    def _wait(self, requests: list[Any], peer: int, what: str) -> None:
+        testall = self._mpi.Request.Testall
+        for _ in range(_SPINS):
+            if testall(requests):
+                return
+        deadline = time.monotonic() + self.timeout_s
+        while not testall(requests):
+            if time.monotonic() > deadline:
+                raise SplatpipeError(f"waited {self.timeout_s:g} s for rank {peer}: {what}")
+            time.sleep(_SLEEP_S)

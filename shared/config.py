@@ -1,0 +1,193 @@
+"""The configuration of a run: TOML in, validated settings out.
+
+``configs/defaults.toml`` states every key with its unit and reason; a test holds that file equal to the defaults
+here. Paths in a file are relative to the file; paths given on the command line are relative to the working directory.
+"""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from .errors import ConfigError
+
+Vector = tuple[float, float, float]
+Matrix = list[list[float]]
+PositiveInt = Annotated[int, Field(ge=1)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=False, frozen=True, allow_inf_nan=False)
+
+
+class Keyframe(_Section):
+    """One key of a keyframe path: where the camera is, at what time in [0, 1], what it looks at."""
+
+    time: Annotated[float, Field(ge=0, le=1)]
+    eye: Vector
+    target: Vector
+    fov_deg: Annotated[float, Field(gt=0, lt=180)] | None = None
+
+
+class SceneSection(_Section):
+    """``[scene]``."""
+
+    path: str = ""
+    verify: bool = True
+
+
+class CameraSection(_Section):
+    """``[camera]``."""
+
+    path: Literal["orbit", "keyframes", "poses"] = "orbit"
+    width: Annotated[int, Field(ge=1, le=16384)] = 1280
+    height: Annotated[int, Field(ge=1, le=16384)] = 720
+    fov_deg: Annotated[float, Field(gt=0, lt=180)] = 45.0
+    near: Annotated[float, Field(ge=0)] = 0.0
+    up: Literal["scene", "x", "y", "z", "-x", "-y", "-z"] = "scene"
+    center: Vector | None = None
+    radius: Annotated[float, Field(ge=0)] = 0.0
+    elevation_deg: Annotated[float, Field(ge=-90, le=90)] = 25.0
+    start_deg: float = 0.0
+    sweep_deg: float = 360.0
+    keyframes: list[Keyframe] = []
+    poses: list[Matrix] = []
+
+
+class CullingSection(_Section):
+    """``[culling]``."""
+
+    backface: bool = False
+
+
+class SamplingSection(_Section):
+    """``[sampling]``."""
+
+    pixel_threshold: Annotated[float, Field(ge=0, le=4096)] = 16.0
+
+
+class RenderSection(_Section):
+    """``[render]``."""
+
+    rasterizer: Literal["auto", "cpu", "gl", "gl-points"] = "auto"
+    threads: Annotated[int, Field(ge=0, le=1024)] = 0
+    point_size_px: Annotated[int, Field(ge=1, le=255)] = 1
+    point_size_world: Annotated[float, Field(ge=0)] = 0.0
+    point_size_max_px: Annotated[int, Field(ge=1, le=255)] = 64
+    colour: str = "auto"
+    colormap: str = "viridis"
+    colour_range: tuple[float, float] | None = None
+    background: str = "#1e2127"
+
+
+class PipelineSection(_Section):
+    """``[pipeline]``."""
+
+    topology: Literal["auto", "single", "pipelined"] = "auto"
+    frames_in_flight: Annotated[int, Field(ge=1, le=64)] = 4
+    timeout_s: Positive = 300.0
+
+
+class OutputSection(_Section):
+    """``[output]``."""
+
+    directory: str = "frames"
+    frames: PositiveInt = 120
+    fps: Annotated[float, Field(gt=0, le=1000)] = 30.0
+    png: bool = True
+    mp4: bool = False
+
+
+class RunConfig(_Section):
+    """Every setting of ``splatpipe run``."""
+
+    scene: SceneSection = SceneSection()
+    camera: CameraSection = CameraSection()
+    culling: CullingSection = CullingSection()
+    sampling: SamplingSection = SamplingSection()
+    render: RenderSection = RenderSection()
+    pipeline: PipelineSection = PipelineSection()
+    output: OutputSection = OutputSection()
+
+
+_PATH_KEYS = (("scene", "path"), ("output", "directory"))
+
+
+def load_config(path: Path | str, overrides: list[str] | None = None) -> RunConfig:
+    """The validated configuration of a TOML file with ``section.key=value`` overrides.
+
+    Raises ConfigError naming the file and key, what was found and what was expected; an unknown key is refused and
+    the nearest known one suggested.
+    """
+    path = Path(path)
+    try:
+        text = path.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+    try:
+        data = tomllib.loads(text.decode("utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not valid TOML: {error}") from None
+    for section, key in _PATH_KEYS:
+        value = data.get(section, {}).get(key) if isinstance(data.get(section), dict) else None
+        if isinstance(value, str) and value:
+            data[section][key] = str(path.parent / value)
+    for override in overrides or []:
+        _apply(data, override)
+    return parse_config(data, source=str(path))
+
+
+def parse_config(data: dict[str, Any], source: str = "configuration") -> RunConfig:
+    """The validated configuration of nested tables. Raises ConfigError as ``load_config`` does."""
+    _refuse_unknown(data, RunConfig, source, "")
+    try:
+        return RunConfig.model_validate(data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        raise ConfigError(f"{source}: {key} = {first['input']!r}, {_expected(first)}") from None
+
+
+def _expected(error: Any) -> str:
+    message = error["msg"].removeprefix("Input ")
+    message = message.replace("should be", "expected").replace("should have", "expected")
+    return message[:1].lower() + message[1:]
+
+
+def _apply(data: dict[str, Any], override: str) -> None:
+    key, equals, text = override.partition("=")
+    parts = key.strip().split(".")
+    if not equals or not all(parts):
+        raise ConfigError(f"--set {override}: expected section.key=value")
+    try:
+        value = tomllib.loads(f"v = {text}")["v"]
+    except tomllib.TOMLDecodeError:
+        value = text  # a bare word is a string: --set render.colour=rgb
+    table = data
+    for part in parts[:-1]:
+        table = table.setdefault(part, {})
+        if not isinstance(table, dict):
+            raise ConfigError(f"--set {override}: {part} is not a section")
+    table[parts[-1]] = value
+
+
+def _refuse_unknown(data: dict[str, Any], model: type[BaseModel], source: str, prefix: str) -> None:
+    for key, value in data.items():
+        field = model.model_fields.get(key)
+        if field is None:
+            near = difflib.get_close_matches(key, model.model_fields, n=1, cutoff=0.0)
+            raise ConfigError(f"{source}: unknown key {prefix}{key}, did you mean {prefix}{near[0]}?")
+        inner = field.annotation
+        items = [value]
+        if get_args(inner) and isinstance(value, list):
+            inner, items = get_args(inner)[0], value
+        if isinstance(inner, type) and issubclass(inner, BaseModel):
+            for item in items:
+                if not isinstance(item, dict):
+                    raise ConfigError(f"{source}: {prefix}{key} = {item!r}, expected a table")
+                _refuse_unknown(item, inner, source, f"{prefix}{key}.")
