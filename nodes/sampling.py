@@ -111,8 +111,7 @@ def _cut(
     pixel_threshold,
     n_drawn,
 ):
-    """Fill ``n_drawn``: points to draw of a cell of the cut, else 0 or ``_EXPANDED``. Number of cells in
-    it."""
+    """Fill ``n_drawn``: points to draw of a cut cell, else 0 or ``_EXPANDED``. Returns the size of the cut."""
     n_cut = 0
     window_end = 1
     cell = 0
