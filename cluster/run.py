@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import sys
 import time
@@ -38,10 +39,12 @@ def run_command(config_path: Path, overrides: list[str], json_path: Path | None)
 
             summary = _finish(job, "single", run_single(job, progress.show), config_path, json_path)
         else:
-            summary = _run_ranks(config_path, overrides, json_path, progress)
-    if summary is not None:
-        _tell(summary)
-    return 0 if summary is not None else 1
+            status = _run_ranks(config_path, overrides, json_path, progress)
+            if status:
+                return status  # the rank that failed has said why
+            summary = json.loads((job.output / "run.json").read_text())
+    _tell(summary)
+    return 0
 
 
 def _topology(config: RunConfig) -> str:
@@ -53,27 +56,14 @@ def _topology(config: RunConfig) -> str:
     return wanted
 
 
-def _run_ranks(
-    config_path: Path, overrides: list[str], json_path: Path | None, progress: FrameProgress
-) -> dict[str, Any] | None:
-    """Start the ranks and show what they report; their summary."""
-    summary: dict[str, Any] = {}
-
-    def on_record(content: dict[str, Any]) -> None:
-        if "summary" in content:
-            summary.update(content["summary"])
-        else:
-            progress.show(content["doing"], content["done"])
-
+def _run_ranks(config_path: Path, overrides: list[str], json_path: Path | None, progress: FrameProgress) -> int:
+    """Start the ranks and show what they report; their exit status."""
     arguments = ["run", str(config_path)]
     for override in overrides:
         arguments += ["--set", override]
     if json_path is not None:
         arguments += ["--json", str(json_path)]
-    status = launch(arguments, PIPELINED_RANKS, on_record)
-    if status:
-        sys.exit(status)  # the rank that failed has said why
-    return summary
+    return launch(arguments, PIPELINED_RANKS, lambda content: progress.show(content["doing"], content["done"]))
 
 
 def _run_rank(config_path: Path, overrides: list[str], json_path: Path | None) -> int:
@@ -125,7 +115,6 @@ def _run_rank(config_path: Path, overrides: list[str], json_path: Path | None) -
         if result is not None:
             topology = "single" if single else "pipelined"
             summary = _finish(job, topology, result | {"mpi": transport.library}, config_path, json_path)
-            record(summary=summary)
             if EXPECTED_RANKS not in os.environ:
                 _tell(summary)
     except BaseException as error:
