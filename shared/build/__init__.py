@@ -1,0 +1,24 @@
+"""Building a scene: batches of points → sequential octree and point-array on disk.
+
+=================  ==================================================================================
+module             owns
+=================  ==================================================================================
+``settings``       what a build is told (``BuildSettings``) and reports (``BuildReport``)
+``ingest``         inputs → columns of finite points
+``morton``         root cube, keys, the counting sort's kernels
+``partition``      keys → cells, and point indices in leaf order
+``flatness``       the eigenvalue criterion
+``sets``           order inside a leaf, level-of-detail sets of inner cells
+``cones``          normal cones
+``subtree``        one partition: the above put together
+``assembly``       subtrees → one sequential octree
+``point_array``    stored points: gathered, made relative to their block, appended
+``writer``         the scene directory: partial, checksums, rename
+``builder``        ``build_scene``: the order of all this
+=================  ==================================================================================
+"""
+
+from .builder import build_scene
+from .settings import BuildReport, BuildSettings
+
+__all__ = ["BuildReport", "BuildSettings", "build_scene"]

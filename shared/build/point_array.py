@@ -1,0 +1,118 @@
+"""The stored points: gathered from memory in their final order, made relative to their block, appended to files."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from ..octree import cell_centers
+from ..points import ATTRIBUTES, PointBatch
+from .parallel import Workers
+from .writer import SceneWriter, writing
+
+_CHUNK = 1 << 18
+_MEAN_BLOCK_POINTS = 1024
+
+
+def block_levels_of(points_per_cell: int) -> int:
+    """How many levels above a cell its block stands: blocks of a surface hold about 1024 points or more.
+
+    Decided by the settings alone, so that the first partition can be written before the last one is read. Cells of a
+    surface hold half of ``points_per_cell`` points in the middle, and four times as many a level up.
+    """
+    levels = 0
+    while points_per_cell / 2 * 4**levels < _MEAN_BLOCK_POINTS:
+        levels += 1
+    return levels
+
+
+@njit(nogil=True, cache=True)
+def _gather_positions(positions, stored, begin, end, block_first, block_origin, x, y, z):
+    block = np.searchsorted(block_first, begin, side="right") - 1
+    for j in range(begin, end):
+        while block + 1 < len(block_first) and block_first[block + 1] <= j:
+            block += 1
+        i = stored[j]
+        x[j - begin] = positions[i, 0] - block_origin[block, 0]
+        y[j - begin] = positions[i, 1] - block_origin[block, 1]
+        z[j - begin] = positions[i, 2] - block_origin[block, 2]
+
+
+@njit(nogil=True, cache=True)
+def _gather(column, stored, begin, end, out):
+    for j in range(begin, end):
+        out[j - begin] = column[stored[j]]
+
+
+class PointArrayWriter:
+    """Appends points to x, y, z and the attribute files, and keeps the table of blocks.
+
+    Each file is one task: it gathers, writes and sums up its own bytes in order, side by side with the others.
+    """
+
+    def __init__(
+        self, writer: SceneWriter, attributes: tuple[str, ...], origin: np.ndarray, edge: float, block_levels: int
+    ) -> None:
+        self.n_stored = 0
+        self._writer = writer
+        self._origin, self._edge, self._levels = origin, edge, block_levels
+        self._xyz = [writer.open_column(name, np.dtype("<f4")) for name in "xyz"]
+        self._columns = {a: writer.open_column(f"attr_{a}", ATTRIBUTES[a]) for a in attributes}
+        self._block_first: list[np.ndarray] = []
+        self._block_origin: list[np.ndarray] = []
+        self._last_block = (-1, -1)
+
+    def append(
+        self,
+        points: PointBatch,
+        stored: np.ndarray,
+        level: np.ndarray,
+        code: np.ndarray,
+        n_points: np.ndarray,
+        workers: Workers,
+    ) -> None:
+        """Append ``points`` picked by ``stored``.
+
+        stored : (m,) uint32 indices of points.
+        level, code, n_points : the cells that own them, one after another, n_points sums up to m.
+        """
+        first, origin = self._open_blocks(level, code, n_points)
+        with writing(self._writer.partial):
+            tasks = [(self._append_positions, points.positions, stored, first, origin)]
+            tasks += [(self._append_column, name, column, stored) for name, column in points.attributes.items()]
+            workers.map(lambda task, *arguments: task(*arguments), tasks)
+        self.n_stored += len(stored)
+
+    def _open_blocks(self, level: np.ndarray, code: np.ndarray, n_points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """First point within these points, and origin, of the runs of cells with one block; noted for the table."""
+        level, code = level.astype(np.int64), code.astype(np.int64)
+        block_level = np.maximum(level - self._levels, 0)
+        block_code = code >> 3 * (level - block_level)
+        starts = np.flatnonzero(np.r_[True, (np.diff(block_level) != 0) | (np.diff(block_code) != 0)])
+        first = (np.cumsum(n_points) - n_points)[starts]
+        origin = cell_centers(self._origin, self._edge, block_level[starts], block_code[starts].astype(np.uint64))
+        blocks = list(zip(block_level[starts].tolist(), block_code[starts].tolist(), strict=True))
+        known = int(blocks[0] == self._last_block)  # goes on from the last call
+        self._block_first.append(first[known:] + self.n_stored)
+        self._block_origin.append(origin[known:])
+        self._last_block = blocks[-1]
+        return first, origin
+
+    def _append_positions(self, positions, stored, first, origin) -> None:
+        xyz = np.empty((3, min(_CHUNK, len(stored))), np.float32)
+        for begin in range(0, len(stored), _CHUNK):
+            end = min(begin + _CHUNK, len(stored))
+            _gather_positions(positions, stored, begin, end, first, origin, *xyz)
+            for file, column in zip(self._xyz, xyz, strict=True):
+                file.write(column[: end - begin])
+
+    def _append_column(self, name: str, column: np.ndarray, stored: np.ndarray) -> None:
+        out = np.empty(min(_CHUNK, len(stored)), column.dtype)
+        for begin in range(0, len(stored), _CHUNK):
+            end = min(begin + _CHUNK, len(stored))
+            _gather(column, stored, begin, end, out)
+            self._columns[name].write(out[: end - begin])
+
+    def blocks(self) -> tuple[np.ndarray, np.ndarray]:
+        """((b,) int64 first point, (b, 3) float64 origin) of all blocks so far."""
+        return np.concatenate(self._block_first), np.concatenate(self._block_origin)

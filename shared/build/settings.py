@@ -1,0 +1,126 @@
+"""What a build is told and what it reports."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from ..errors import InputError
+from ..octree import MAX_LEVEL
+from ..points import ATTRIBUTES
+from ..scene_info import POINT_ORDERS
+
+UP_AXES = ("x", "y", "z", "auto")
+
+
+@dataclass(frozen=True)
+class BuildSettings:
+    """How a scene is built.
+
+    point_order : ``layered`` or ``depth-first``, see ``octree.Octree``.
+    points_per_cell : a cell with more points than this is subdivided; also the most an inner cell owns when layered.
+    max_depth : deepest level, 0 … 21.
+    flatness : cells whose λ0 / (λ0 + λ1 + λ2) is below this stay leaves whatever they hold; 0: not tested.
+    memory_bytes : peak memory of the process; None for half of what is available.
+    strict : refuse coordinates that are not finite, instead of dropping the point.
+    overwrite : replace an existing scene, once the new one is whole.
+    up : axis that points up, stored in the scene: ``x``, ``y``, ``z`` or ``auto``.
+    attributes : the ones to keep; None for all.
+    threads : None for one a core.
+
+    Raises InputError for a value out of range.
+    """
+
+    point_order: str = "layered"
+    points_per_cell: int = 4096
+    max_depth: int = MAX_LEVEL
+    flatness: float = 0.0
+    memory_bytes: int | None = None
+    strict: bool = False
+    overwrite: bool = False
+    up: str = "auto"
+    attributes: tuple[str, ...] | None = None
+    threads: int | None = None
+
+    def __post_init__(self) -> None:
+        unknown = [a for a in self.attributes or () if a not in ATTRIBUTES]
+        for holds, key, expected in (
+            (self.point_order in POINT_ORDERS, "point_order", f"one of {', '.join(POINT_ORDERS)}"),
+            (1 <= self.points_per_cell <= 1 << 24, "points_per_cell", "1 … 16777216"),
+            (0 <= self.max_depth <= MAX_LEVEL, "max_depth", f"0 … {MAX_LEVEL}"),
+            (0 <= self.flatness <= 1 / 3, "flatness", "a number in [0, 1/3]"),
+            (self.memory_bytes is None or self.memory_bytes > 0, "memory_bytes", "a number > 0"),
+            (self.up in UP_AXES, "up", f"one of {', '.join(UP_AXES)}"),
+            (not unknown, "attributes", f"names of {', '.join(ATTRIBUTES)}"),
+            (self.threads is None or self.threads >= 1, "threads", "at least 1"),
+        ):
+            if not holds:
+                raise InputError(f"build: {key} = {getattr(self, key)!r}, expected {expected}")
+
+
+@dataclass
+class BuildReport:
+    """What a build did.
+
+    n_dropped : points left out because a coordinate was not finite.
+    dropped_attributes : in some of the inputs, but not in all of them.
+    n_partitions : subtrees that were built one after the other; 1 if the input fitted into memory.
+    spilled_bytes : written to sorted runs and read again; 0 if the input fitted into memory.
+    stage_s : seconds in each stage.
+    """
+
+    path: Path
+    n_points: int
+    n_stored: int
+    n_cells: int
+    n_dropped: int
+    dropped_attributes: tuple[str, ...]
+    n_partitions: int
+    spilled_bytes: int
+    bytes: int
+    stage_s: dict[str, float] = field(default_factory=dict)
+
+
+def available_memory_bytes() -> int:
+    """Memory this process may still take: the least of what the machine and its control groups leave."""
+    available = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_AVPHYS_PAGES")
+    meminfo = Path("/proc/meminfo")
+    if meminfo.exists():
+        for line in meminfo.read_text().splitlines():
+            if line.startswith("MemAvailable:"):
+                available = int(line.split()[1]) * 1024
+    return min([available, *_control_group_limits()])
+
+
+def _control_group_limits() -> list[int]:
+    """Bytes left below each memory limit of the process's control groups (versions 2 and 1)."""
+    left = []
+    for limit, used in (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes")):
+        for root in (Path("/sys/fs/cgroup"), Path("/sys/fs/cgroup/memory"), *_own_control_groups()):
+            try:
+                left.append(int((root / limit).read_text()) - int((root / used).read_text()))
+            except (OSError, ValueError):  # no such group, or the word "max"
+                continue
+    return [n for n in left if n > 0]
+
+
+def _own_control_groups() -> list[Path]:
+    try:
+        lines = Path("/proc/self/cgroup").read_text().splitlines()
+    except OSError:
+        return []
+    groups = []
+    for line in lines:
+        _, controllers, name = line.split(":", 2)
+        group = Path("/sys/fs/cgroup", "memory" if "memory" in controllers else "", name.lstrip("/"))
+        groups += [group, *(p for p in group.parents if p.is_relative_to("/sys/fs/cgroup"))]
+    return groups
+
+
+def resident_bytes() -> int:
+    """Memory the process holds now."""
+    try:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except OSError:
+        return 0

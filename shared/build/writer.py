@@ -1,0 +1,175 @@
+"""Writing a scene: into ``OUT.partial`` beside the target, renamed to it once everything is whole."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import shutil
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from ..errors import InputError
+from ..scene_info import SCENE_FILE, ArrayInfo, SceneInfo
+
+_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn a failure to write below ``path`` into one line."""
+    try:
+        yield
+    except OSError as error:
+        cause = "disk full" if error.errno in _FULL else error.strerror or str(error)
+        raise InputError(f"{error.filename or path}: cannot be written: {cause}") from error
+
+
+class ColumnFile:
+    """An ``.npy`` file that grows by chunks; its header gets the final shape when it is closed."""
+
+    def __init__(self, directory: Path, name: str, dtype: np.dtype, row_shape: tuple[int, ...] = ()) -> None:
+        self.path = directory / f"{name}.npy"
+        self.dtype = dtype
+        self._row_shape = row_shape
+        self._rows = 0
+        self._crc = 0
+        self._file: IO[bytes] = open(self.path, "wb", buffering=0)  # noqa: SIM115 - closed by close()
+        self._write_header()
+        self._data_offset = self._file.tell()
+
+    def _write_header(self) -> None:
+        np.lib.format.write_array_header_1_0(
+            self._file,
+            {"descr": self.dtype.str, "fortran_order": False, "shape": (self._rows, *self._row_shape)},
+        )
+
+    def write(self, rows: np.ndarray) -> None:
+        """Append C-contiguous rows."""
+        data = memoryview(rows.view(np.uint8)).cast("B") if rows.size else b""
+        self._crc = zlib.crc32(data, self._crc)
+        while data:
+            data = data[self._file.write(data) :]
+        self._rows += len(rows)
+
+    def close(self) -> ArrayInfo:
+        """Write the final header."""
+        size = self._file.tell() - self._data_offset
+        self._file.seek(0)
+        self._write_header()
+        assert self._file.tell() == self._data_offset  # numpy leaves room for any length of a first axis
+        self._file.close()
+        return ArrayInfo(self.dtype.str, (self._rows, *self._row_shape), size, self._crc)
+
+    def abandon(self) -> None:
+        """Close the file as it is."""
+        self._file.close()
+
+
+class SceneWriter:
+    """Owns ``OUT.partial`` from the start of a build to the rename; a context manager.
+
+    A killed build leaves only that directory, which the next build of the same scene removes: it starts clean.
+    Leaving the context without ``commit`` removes it. The data files are not forced to the disk (a scene whose machine
+    lost power is found out by its sizes and checksums), ``scene.json`` and the rename are.
+
+    Raises InputError if the target exists and ``overwrite`` is not set, is not a scene, is being built by another
+    process, or cannot be written.
+    """
+
+    def __init__(self, out: Path, *, overwrite: bool) -> None:
+        self.out = out
+        self.partial = out.with_name(out.name + ".partial")
+        self._replaced = out.with_name(out.name + ".replaced")
+        self._overwrite = overwrite
+        self.columns: dict[str, ColumnFile] = {}
+        self.arrays: dict[str, ArrayInfo] = {}
+        check_target(out, overwrite)
+
+    def __enter__(self) -> SceneWriter:
+        with writing(self.out):
+            self.out.parent.mkdir(parents=True, exist_ok=True)
+            self.partial.mkdir(exist_ok=True)
+            self._lock = os.open(self.partial, os.O_RDONLY)
+            try:
+                fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                os.close(self._lock)
+                raise InputError(f"{self.out}: another build of it is running ({self.partial})") from None
+            _empty(self.partial)
+            if self._replaced.exists():  # killed between the two renames of ``commit``
+                if self.out.exists():
+                    shutil.rmtree(self._replaced)
+                else:
+                    self._replaced.rename(self.out)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for column in self.columns.values():
+            column.abandon()
+        if self.partial.exists():
+            shutil.rmtree(self.partial, ignore_errors=True)
+        os.close(self._lock)
+
+    def open_column(self, name: str, dtype: np.dtype, row_shape: tuple[int, ...] = ()) -> ColumnFile:
+        """A new growing array of the scene."""
+        with writing(self.partial):
+            self.columns[name] = ColumnFile(self.partial, name, dtype, row_shape)
+        return self.columns[name]
+
+    def write_array(self, name: str, array: np.ndarray) -> None:
+        """A whole array of the scene."""
+        array = np.ascontiguousarray(array)
+        with writing(self.partial):
+            self.open_column(name, array.dtype, array.shape[1:]).write(array)
+
+    def close_columns(self) -> dict[str, ArrayInfo]:
+        """Finish every array and say what was written."""
+        with writing(self.partial):
+            return {name: column.close() for name, column in self.columns.items()}
+
+    def commit(self, info: SceneInfo) -> None:
+        """Write ``scene.json`` and put the directory in the target's place."""
+        with writing(self.partial):
+            with open(self.partial / SCENE_FILE, "w", encoding="utf-8") as file:
+                file.write(info.to_json())
+                file.flush()
+                os.fsync(file.fileno())
+            check_target(self.out, self._overwrite)
+            if self.out.exists():
+                self.out.rename(self._replaced)
+            self.partial.rename(self.out)
+            parent = os.open(self.out.parent, os.O_RDONLY)
+            os.fsync(parent)
+            os.close(parent)
+            shutil.rmtree(self._replaced, ignore_errors=True)
+
+
+def check_target(out: Path, overwrite: bool) -> None:
+    """Raise InputError if a scene must not be written to ``out``."""
+    if not out.name:
+        raise InputError(f"{out}: cannot be the name of a scene")
+    if not out.exists() and not out.is_symlink():
+        return
+    if not out.is_dir() or not ((out / SCENE_FILE).is_file() or not any(out.iterdir())):
+        raise InputError(f"{out}: exists and is not a scene, expected a new name or a scene")
+    if not overwrite and (out / SCENE_FILE).is_file():
+        raise InputError(f"{out}: the scene exists, expected a new name or overwrite")
+
+
+def _empty(directory: Path) -> None:
+    for entry in directory.iterdir():
+        if entry.is_dir() and not entry.is_symlink():
+            shutil.rmtree(entry)
+        else:
+            entry.unlink()
+
+
+def settings_json(settings: Any) -> dict[str, Any]:
+    """A settings dataclass as JSON types, in ``scene.json``."""
+    return {k: list(v) if isinstance(v, tuple) else v for k, v in vars(settings).items()}

@@ -1,0 +1,216 @@
+"""``scene.json``: what a scene says of itself, and the checks before any of it is believed."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .errors import StoreError
+from .points import ATTRIBUTES
+
+FORMAT_VERSION = 1
+SCENE_FILE = "scene.json"
+POINT_ORDERS = ("layered", "depth-first")
+CELL_ARRAYS = {
+    "cell_level": np.dtype("u1"),
+    "cell_code": np.dtype("<u8"),
+    "cell_parent": np.dtype("<i4"),
+    "cell_first_child": np.dtype("<i4"),
+    "cell_n_children": np.dtype("u1"),
+    "cell_first_point": np.dtype("<i8"),
+    "cell_n_points": np.dtype("<i8"),
+    "cell_n_below": np.dtype("<i8"),
+    "cell_cone": np.dtype("<f4"),
+}
+_MAX_BYTES = 1 << 26
+
+
+@dataclass(frozen=True)
+class ArrayInfo:
+    """One array as ``scene.json`` promises it. crc32 : of the data bytes, the header left out."""
+
+    dtype: str
+    shape: tuple[int, ...]
+    bytes: int
+    crc32: int
+
+
+@dataclass(frozen=True)
+class SourceCount:
+    """An input file: its base name and the points it gave, dropped ones left out."""
+
+    name: str
+    n_points: int
+
+
+@dataclass(frozen=True)
+class SceneInfo:
+    """What ``scene.json`` holds.
+
+    origin, edge : the root cube.  lower, upper : tight bounds of the input points; world frame.
+    n_points : input points.  n_stored : points in the point-array, level-of-detail copies included.
+    n_dropped : input points left out because a coordinate was not finite.
+    block_levels : a block of cells is the subtree of the ancestor this many levels above a cell.
+    up : ``x``, ``y``, ``z`` or ``auto``.  crs : well-known text, or None.
+    build : the settings the scene was built with.
+    """
+
+    point_order: str
+    origin: tuple[float, float, float]
+    edge: float
+    lower: tuple[float, float, float]
+    upper: tuple[float, float, float]
+    n_points: int
+    n_stored: int
+    n_cells: int
+    n_blocks: int
+    n_dropped: int
+    attributes: tuple[str, ...]
+    block_levels: int
+    up: str
+    crs: str | None
+    sources: tuple[SourceCount, ...]
+    build: dict[str, Any]
+    arrays: dict[str, ArrayInfo]
+    format_version: int = FORMAT_VERSION
+
+    def to_json(self) -> str:
+        """The text of ``scene.json``."""
+        return json.dumps(asdict(self), indent=1, allow_nan=False) + "\n"
+
+
+def parse_info(path: Path) -> SceneInfo:
+    """The checked content of a ``scene.json``.
+
+    Raises StoreError if it is missing, not JSON, of a newer version, or a key is missing or of the wrong kind.
+    """
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise StoreError(f"{path}: found {path.stat().st_size} bytes, expected at most {_MAX_BYTES}")
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise StoreError(f"{path.parent}: not a scene: {path.name} not found") from None
+    except OSError as error:
+        raise StoreError(f"{path}: cannot be read: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
+        raise StoreError(f"{path}: not valid JSON: {error}") from error
+    if not isinstance(content, dict):
+        raise StoreError(f"{path}: found {type(content).__name__}, expected an object")
+    version = content.get("format_version")
+    if not _is_count(version) or version < 1:
+        raise StoreError(f"{path}: format_version = {version!r}, expected a whole number ≥ 1")
+    if version > FORMAT_VERSION:
+        raise StoreError(
+            f"{path}: format_version = {version}, this splatpipe reads up to {FORMAT_VERSION}: "
+            "upgrade splatpipe, or build the scene again"
+        )
+    for field in fields(SceneInfo):
+        if field.name not in content:
+            raise StoreError(f"{path}: {field.name} not found")
+    for key, (accepts, expected) in _RULES.items():
+        if not accepts(content[key]):
+            raise StoreError(f"{path}: {key} = {str(content[key])[:80]}, expected {expected}")
+    known = {field.name for field in fields(SceneInfo)}
+    values = {key: value for key, value in content.items() if key in known}
+    for key in ("origin", "lower", "upper", "attributes"):
+        values[key] = tuple(values[key])
+    values["sources"] = tuple(SourceCount(s["name"], s["n_points"]) for s in values["sources"])
+    values["arrays"] = {
+        name: ArrayInfo(a["dtype"], tuple(a["shape"]), a["bytes"], a["crc32"]) for name, a in values["arrays"].items()
+    }
+    info = SceneInfo(**values)
+    _check_arrays(path, info)
+    return info
+
+
+def expected_arrays(info: SceneInfo) -> dict[str, tuple[np.dtype, tuple[int, ...]]]:
+    """(dtype, shape) of each array that a scene of these counts and attributes has."""
+    expected: dict[str, tuple[np.dtype, tuple[int, ...]]] = {}
+    for name, dtype in CELL_ARRAYS.items():
+        if name != "cell_cone" or "normal" in info.attributes:
+            expected[name] = (dtype, (info.n_cells, 4) if name == "cell_cone" else (info.n_cells,))
+    for name in ("x", "y", "z"):
+        expected[name] = (np.dtype("<f4"), (info.n_stored,))
+    for name in info.attributes:
+        expected[f"attr_{name}"] = (ATTRIBUTES[name], (info.n_stored,))
+    expected["block_first_point"] = (np.dtype("<i8"), (info.n_blocks,))
+    expected["block_origin"] = (np.dtype("<f8"), (info.n_blocks, 3))
+    return expected
+
+
+def _check_arrays(path: Path, info: SceneInfo) -> None:
+    expected = expected_arrays(info)
+    if set(expected) != set(info.arrays):
+        odd = sorted(set(expected) ^ set(info.arrays))[0]
+        raise StoreError(f"{path}: arrays: {odd} is {'missing' if odd in expected else 'unknown'}")
+    for name, (dtype, shape) in expected.items():
+        found = info.arrays[name]
+        if found.dtype != dtype.str or found.shape != shape:
+            raise StoreError(f"{path}: array {name}: found {found.dtype} {found.shape}, expected {dtype.str} {shape}")
+        if found.bytes != math.prod(shape) * dtype.itemsize:
+            raise StoreError(
+                f"{path}: array {name}: found {found.bytes} bytes, expected {math.prod(shape) * dtype.itemsize}"
+            )
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 1 << 62
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
+
+
+def _is_point(value: Any) -> bool:
+    return isinstance(value, list) and len(value) == 3 and all(_is_number(v) for v in value)
+
+
+def _is_array_info(value: Any) -> bool:
+    return (
+        isinstance(value, dict)
+        and isinstance(value.get("dtype"), str)
+        and isinstance(value.get("shape"), list)
+        and all(_is_count(n) for n in value["shape"])
+        and _is_count(value.get("bytes"))
+        and _is_count(value.get("crc32"))
+    )
+
+
+def _is_source(value: Any) -> bool:
+    return isinstance(value, dict) and isinstance(value.get("name"), str) and _is_count(value.get("n_points"))
+
+
+_POSITIVE = (lambda v: _is_count(v) and v > 0, "a whole number > 0")
+_COUNT = (_is_count, "a whole number ≥ 0")
+_POINT = (_is_point, "three finite numbers")
+_RULES = {
+    "point_order": (lambda v: v in POINT_ORDERS, f"one of {', '.join(POINT_ORDERS)}"),
+    "origin": _POINT,
+    "edge": (lambda v: _is_number(v) and v > 0, "a number > 0"),
+    "lower": _POINT,
+    "upper": _POINT,
+    "n_points": _POSITIVE,
+    "n_stored": _POSITIVE,
+    "n_cells": _POSITIVE,
+    "n_blocks": _POSITIVE,
+    "n_dropped": _COUNT,
+    "attributes": (
+        lambda v: isinstance(v, list) and len(set(map(str, v))) == len(v) and all(a in ATTRIBUTES for a in v),
+        f"different names of {', '.join(ATTRIBUTES)}",
+    ),
+    "block_levels": _COUNT,
+    "up": (lambda v: v in ("x", "y", "z", "auto"), "x, y, z or auto"),
+    "crs": (lambda v: v is None or isinstance(v, str), "a text or null"),
+    "sources": (lambda v: isinstance(v, list) and all(_is_source(s) for s in v), "a list of name and n_points"),
+    "build": (lambda v: isinstance(v, dict), "an object"),
+    "arrays": (
+        lambda v: isinstance(v, dict) and all(_is_array_info(a) for a in v.values()),
+        "objects of dtype, shape, bytes and crc32",
+    ),
+}
