@@ -1,0 +1,378 @@
+"""Camera paths: from a frame number to a camera.
+
+A path gives, for a time in [0, 1], a pose (``world_from_camera``) and a vertical field of view; ``CameraPath`` adds
+what all frames share. A closed path spreads its frames over [0, 1), so that the film loops; an open one over [0, 1].
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from .camera import Camera, look_at, perspective_camera
+from .errors import ConfigError
+
+if TYPE_CHECKING:
+    from .config import CameraSection
+    from .store import SceneInfo
+
+NEAR_SHARE = 1e-4
+"""Default near plane as a share of the scene's radius: reversed depth does not suffer from a small one, and a camera
+inside the scene sees what is close."""
+
+_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+_SURVEY_ATTRIBUTES = {"rgb", "intensity", "classification", "return_number", "gps_time"}
+
+
+class Path(Protocol):
+    """Where the camera is over time."""
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether time 1 is time 0 again."""
+        ...
+
+    def pose(self, time: float) -> np.ndarray:
+        """(4, 4) float64 world_from_camera at a time in [0, 1]."""
+        ...
+
+    def fov_y_rad(self, time: float) -> float:
+        """Vertical field of view at a time in [0, 1]."""
+        ...
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """The cameras of a film of ``n_frames`` frames; width and height in pixels, near in world units."""
+
+    path: Path
+    n_frames: int
+    width: int
+    height: int
+    near: float
+
+    def camera(self, frame: int) -> Camera:
+        """The camera of a frame in [0, n_frames)."""
+        time = frame / (self.n_frames if self.path.is_closed else max(self.n_frames - 1, 1))
+        return perspective_camera(
+            frame=frame,
+            world_from_camera=self.path.pose(time),
+            fov_y_rad=self.path.fov_y_rad(time),
+            width=self.width,
+            height=self.height,
+            near=self.near,
+        )
+
+
+def camera_path(settings: CameraSection, scene: SceneInfo, n_frames: int) -> CameraPath:
+    """The path that a configuration asks for, around or through a scene.
+
+    Raises ConfigError for keyframes or poses that make no path, InputError for a pose that is not rigid.
+    """
+    lower, upper = np.array(scene.lower), np.array(scene.upper)
+    up = up_vector(scene) if settings.up == "scene" else axis_vector(settings.up)
+    fov_rad = math.radians(settings.fov_deg)
+    match settings.path:
+        case "orbit":
+            center = (lower + upper) / 2 if settings.center is None else np.array(settings.center)
+            elevation_rad = math.radians(settings.elevation_deg)
+            aspect = settings.width / settings.height
+            radius = settings.radius or orbit_radius(lower, upper, center, up, elevation_rad, fov_rad, aspect)
+            path = OrbitPath(
+                center,
+                radius,
+                up,
+                fov_rad,
+                elevation_rad,
+                math.radians(settings.start_deg),
+                math.radians(settings.sweep_deg),
+            )
+        case "keyframes":
+            keys = [
+                Key(k.time, np.array(k.eye), np.array(k.target), math.radians(k.fov_deg or settings.fov_deg))
+                for k in settings.keyframes
+            ]
+            path = KeyframePath(tuple(keys), up)
+        case "poses":
+            path = PosesPath.checked(settings.poses, fov_rad, n_frames)
+    near = settings.near or NEAR_SHARE * (float(np.linalg.norm(upper - lower)) / 2 or 1.0)
+    return CameraPath(path, n_frames, settings.width, settings.height, near)
+
+
+def axis_vector(name: str) -> np.ndarray:
+    """(3,) float64 unit vector of ``x``, ``y``, ``z`` or one of them with a minus sign."""
+    axis = np.array(_AXES[name.removeprefix("-")])
+    return -axis if name.startswith("-") else axis
+
+
+def up_vector(scene: SceneInfo) -> np.ndarray:
+    """(3,) float64 unit axis that points up in a scene.
+
+    Where the scene does not say, z; but y for a bare model (normals, and nothing that a survey has), as is the custom
+    in computer graphics.
+    """
+    if scene.up != "auto":
+        return axis_vector(scene.up)
+    is_model = "normal" in scene.attributes and scene.crs is None and not _SURVEY_ATTRIBUTES & set(scene.attributes)
+    return axis_vector("y" if is_model else "z")
+
+
+# --- orbit ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class OrbitPath:
+    """A circle around a centre, looking at it; defined at the poles too.
+
+    center : (3,) float64, world.  radius : distance of the eye, world units.  up : (3,) float64, a unit axis.
+    elevation_rad : height above the horizon, in [−π/2, π/2].  start_rad, sweep_rad : azimuth at time 0 and how far it
+    turns, counter-clockwise seen from above.
+    """
+
+    center: np.ndarray
+    radius: float
+    up: np.ndarray
+    fov_rad: float
+    elevation_rad: float = 0.0
+    start_rad: float = 0.0
+    sweep_rad: float = 2 * math.pi
+
+    @property
+    def is_closed(self) -> bool:
+        """A whole number of turns, at least one."""
+        turns = abs(self.sweep_rad) / (2 * math.pi)
+        return round(turns) > 0 and math.isclose(turns, round(turns))
+
+    def fov_y_rad(self, time: float) -> float:
+        """Constant."""
+        return self.fov_rad
+
+    def pose(self, time: float) -> np.ndarray:
+        """(4, 4) float64 world_from_camera."""
+        azimuth = self.start_rad + time * self.sweep_rad
+        first = np.roll(np.abs(self.up), 1)  # x where z is up
+        second = np.cross(self.up, first)
+        outwards = math.cos(azimuth) * first + math.sin(azimuth) * second
+        back = math.cos(self.elevation_rad) * outwards + math.sin(self.elevation_rad) * self.up
+        right = math.cos(azimuth) * second - math.sin(azimuth) * first
+        return _rigid(np.column_stack([right, np.cross(back, right), back]), self.center + self.radius * back)
+
+
+def orbit_radius(
+    lower: np.ndarray,
+    upper: np.ndarray,
+    center: np.ndarray,
+    up: np.ndarray,
+    elevation_rad: float,
+    fov_y_rad: float,
+    aspect: float,
+) -> float:
+    """Least distance from which the box lower…upper is in the image from every azimuth; 1 for a single point.
+
+    Closed form for the cylinder that the box sweeps: over the azimuth θ and the upper and lower rim, the largest
+    ``depth offset + |x| / tan(fov_x/2)`` and ``depth offset + |y| / tan(fov_y/2)``.
+    """
+    reach = np.maximum(upper - center, center - lower)
+    half_height = float(np.abs(up) @ reach)
+    rim = math.sqrt(max(float(reach @ reach) - half_height**2, 0.0))
+    tan_y = math.tan(fov_y_rad / 2)
+    tan_x = tan_y * aspect
+    sin_e, cos_e = abs(math.sin(elevation_rad)), math.cos(elevation_rad)
+    sideways = rim * math.hypot(cos_e, 1 / tan_x) + half_height * sin_e
+    above = half_height * abs(sin_e + cos_e / tan_y) + rim * abs(cos_e - sin_e / tan_y)
+    below = half_height * abs(sin_e - cos_e / tan_y) + rim * abs(cos_e + sin_e / tan_y)
+    return max(sideways, above, below) or 1.0
+
+
+# --- keyframes --------------------------------------------------------------------------------------------------
+
+_TANGENT_LIMIT = 1.5
+"""Longest tangent at a key, in units of the slower of its two neighbouring chords. It makes the camera rest between
+equal keys, and keeps interpolated quaternions away from zero: chords of at most 90° on the sphere stay above 0.07."""
+
+
+@dataclass(frozen=True)
+class Key:
+    """Where the camera is at a time, what it looks at (both (3,) float64, world), and its vertical field of view."""
+
+    time: float
+    eye: np.ndarray
+    target: np.ndarray
+    fov_y_rad: float
+
+
+@dataclass(frozen=True)
+class KeyframePath:
+    """A smooth path through keys: eye, orientation and focal length are continuously differentiable in time.
+
+    At a key the camera looks from eye to target, with ``up`` upwards. Between keys the orientation is interpolated by
+    itself, so that it is defined, and does not flip, where two keys look in opposite directions. Between two equal
+    keys the camera rests, as it does before the first and after the last. If the last key repeats the first, the
+    path is closed and smooth there too.
+
+    Raises ConfigError for no keys, times that do not ascend, or a key whose target is its eye.
+    """
+
+    keys: tuple[Key, ...]
+    up: np.ndarray
+
+    def __post_init__(self):
+        if not self.keys:
+            raise ConfigError("camera.keyframes: found none, expected at least one")
+        for i, key in enumerate(self.keys):
+            if i and not key.time > self.keys[i - 1].time:
+                raise ConfigError(
+                    f"camera.keyframes[{i}].time = {key.time}, expected more than {self.keys[i - 1].time}"
+                )
+            if np.array_equal(key.eye, key.target):
+                raise ConfigError(f"camera.keyframes[{i}]: eye and target coincide at {np.asarray(key.eye).tolist()}")
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether the last key repeats the first."""
+        first, last = self.keys[0], self.keys[-1]
+        same = np.array_equal(first.eye, last.eye) and np.array_equal(first.target, last.target)
+        return len(self.keys) > 2 and same and first.fov_y_rad == last.fov_y_rad
+
+    def pose(self, time: float) -> np.ndarray:
+        """(4, 4) float64 world_from_camera."""
+        return _rigid(_rotation(self._orientation.at(time)), self._eye.at(time))
+
+    def fov_y_rad(self, time: float) -> float:
+        """Interpolated in the logarithm of the focal length: a zoom at an even rate, never out of (0, π)."""
+        return 2 * math.atan(math.exp(self._log_tan.at(time)[0]))
+
+    @cached_property
+    def _eye(self) -> _Hermite:
+        return self._curve([key.eye for key in self.keys])
+
+    @cached_property
+    def _log_tan(self) -> _Hermite:
+        return self._curve([[math.log(math.tan(key.fov_y_rad / 2))] for key in self.keys])
+
+    @cached_property
+    def _orientation(self) -> _Hermite:
+        quaternions: list[np.ndarray] = []
+        for rotation in self._rotations():
+            q = _quaternion(rotation)
+            quaternions.append(-q if quaternions and quaternions[-1] @ q < 0 else q)  # the shorter way round
+        return self._curve(quaternions)
+
+    def _rotations(self) -> list[np.ndarray]:
+        """(3, 3) of each key. One that looks straight up or down keeps the heading of the nearest one that does not."""
+        axes = [(key.target - key.eye) / np.linalg.norm(key.target - key.eye) for key in self.keys]
+        vertical = [float(np.linalg.norm(np.cross(axis, self.up))) < 1e-6 for axis in axes]
+        oblique = [i for i, is_vertical in enumerate(vertical) if not is_vertical]
+        rotations = []
+        for i, axis in enumerate(axes):
+            up = self.up
+            if vertical[i] and oblique:
+                nearest = axes[min(oblique, key=lambda j: abs(j - i))]
+                up = -np.sign(axis @ self.up) * (nearest - (nearest @ self.up) * self.up)
+            rotations.append(look_at(np.zeros(3), axis, up)[:3, :3])
+        return rotations
+
+    def _curve(self, values: list) -> _Hermite:
+        times = np.array([key.time for key in self.keys])
+        return _Hermite.through(times, np.array(values, np.float64), self.is_closed)
+
+
+@dataclass(frozen=True)
+class _Hermite:
+    """A C¹ cubic through (k, d) values at (k,) ascending times; constant outside them."""
+
+    times: np.ndarray
+    values: np.ndarray
+    tangents: np.ndarray
+
+    @classmethod
+    def through(cls, times: np.ndarray, values: np.ndarray, is_closed: bool) -> _Hermite:
+        """Tangents by Catmull and Rom for uneven times, limited as ``_TANGENT_LIMIT`` says; ends as closed asks."""
+        if len(times) == 1:
+            return cls(times, values, np.zeros_like(values))
+        step = np.diff(times)[:, None]
+        chord = np.diff(values, axis=0) / step
+        sign = -1.0 if values[0] @ values[-1] < 0 else 1.0  # a full turn ends at the opposite quaternion
+        before = np.vstack([sign * chord[-1:] if is_closed else chord[:1], chord])
+        after = np.vstack([chord, sign * chord[:1] if is_closed else chord[-1:]])
+        step_before, step_after = np.vstack([step[-1:], step]), np.vstack([step, step[:1]])
+        tangents = (step_after * before + step_before * after) / (step_before + step_after)
+        speed = np.minimum(np.linalg.norm(before, axis=1), np.linalg.norm(after, axis=1))
+        length = np.linalg.norm(tangents, axis=1)
+        limit = np.minimum(1.0, _TANGENT_LIMIT * speed / np.where(length > 0, length, 1.0))
+        return cls(times, values, tangents * limit[:, None])
+
+    def at(self, time: float) -> np.ndarray:
+        """(d,) float64 value at a time."""
+        if len(self.times) == 1:
+            return self.values[0]
+        time = min(max(time, self.times[0]), self.times[-1])
+        i = min(int(np.searchsorted(self.times, time, side="right")) - 1, len(self.times) - 2)
+        step = self.times[i + 1] - self.times[i]
+        s = (time - self.times[i]) / step
+        return (
+            (1 + 2 * s) * (1 - s) ** 2 * self.values[i]
+            + s * (1 - s) ** 2 * step * self.tangents[i]
+            + s * s * (3 - 2 * s) * self.values[i + 1]
+            - s * s * (1 - s) * step * self.tangents[i + 1]
+        )
+
+
+def _quaternion(rotation: np.ndarray) -> np.ndarray:
+    """(4,) unit quaternion (x, y, z, w) of a (3, 3) rotation, of either sign. Source: Bar-Itzhack 2000."""
+    r = rotation
+    k = np.empty((4, 4))
+    k[:3, :3] = r + r.T - np.trace(r) * np.eye(3)
+    k[3, :3] = k[:3, 3] = (r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1])
+    k[3, 3] = np.trace(r)
+    return np.linalg.eigh(k)[1][:, -1]
+
+
+def _rotation(quaternion: np.ndarray) -> np.ndarray:
+    """(3, 3) rotation of a quaternion (x, y, z, w) of any length but zero."""
+    q = quaternion / np.linalg.norm(quaternion)
+    v, w = q[:3], q[3]
+    cross = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+    return np.eye(3) + 2 * w * cross + 2 * cross @ cross
+
+
+# --- explicit poses ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class PosesPath:
+    """One given pose a frame: world_from_camera, (n, 4, 4) or (n, 3, 4) float64."""
+
+    world_from_camera: np.ndarray
+    fov_rad: float
+    is_closed: bool = False
+
+    @classmethod
+    def checked(cls, matrices: list[list[list[float]]], fov_rad: float, n_frames: int) -> PosesPath:
+        """Raises ConfigError unless there is one 4×4 or 3×4 matrix a frame."""
+        if len(matrices) != n_frames:
+            raise ConfigError(f"camera.poses: found {len(matrices)}, expected {n_frames}, one a frame (output.frames)")
+        for i, matrix in enumerate(matrices):
+            if len(matrix) not in (3, 4) or any(len(row) != 4 for row in matrix):
+                raise ConfigError(
+                    f"camera.poses[{i}]: found {[len(row) for row in matrix]} numbers, expected 4×4 or 3×4"
+                )
+        return cls(np.array([matrix[:3] for matrix in matrices], np.float64), fov_rad)
+
+    def fov_y_rad(self, time: float) -> float:
+        """Constant."""
+        return self.fov_rad
+
+    def pose(self, time: float) -> np.ndarray:
+        """The pose of the frame nearest to a time."""
+        return self.world_from_camera[round(time * (len(self.world_from_camera) - 1))]
+
+
+def _rigid(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, translation
+    return pose
