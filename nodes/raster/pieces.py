@@ -35,7 +35,7 @@ def split_entries(entries: np.ndarray, segment_first: np.ndarray, n_points: int,
     Raises MessageError as ``check_entries`` does.  Cost: O(m log s + p), two compiled passes.
     """
     check_entries(entries, n_points)
-    offset, length, stride = (np.ascontiguousarray(entries[k]) for k in ("offset", "range", "stride"))
+    offset, length, stride = (entries[k].copy() for k in ("offset", "range", "stride"))  # one type for numba
     borders = np.append(segment_first[1:], n_points).astype(np.int64)
     none = np.empty(0, PIECE)
     out = np.empty(_split(offset.view(np.int64), length, stride, borders, limit, none), PIECE)
