@@ -1,0 +1,114 @@
+"""OpenGL without a display: a context on an EGL device, its limits, its errors, its shader sources.
+
+Whether OpenGL works is tried in a child process, so that a driver that crashes takes only the child with it.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import subprocess
+import sys
+from functools import cache
+from importlib.resources import files
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
+
+from ...shared.errors import DeviceError
+
+if TYPE_CHECKING:
+    import moderngl
+
+_LIBRARIES = {"libegl": "libEGL.so.1", "libgl": "libGL.so.1"}
+_VERSION = 430  # compute shaders and storage buffers
+_PROBE_S = 60
+
+
+@cache
+def gl_available() -> tuple[bool, str]:
+    """(True, renderer) if the default EGL device draws, else (False, reason and what to install).
+
+    Never raises. Cost: about half a second, the first time.
+    """
+    try:
+        _check_installed()
+        probe = subprocess.run(
+            [sys.executable, "-m", __name__], capture_output=True, text=True, timeout=_PROBE_S, check=False
+        )
+    except (DeviceError, OSError, subprocess.SubprocessError) as error:
+        return False, str(error)
+    if probe.returncode == 0:
+        return True, probe.stdout.strip()
+    if probe.returncode < 0:
+        return False, f"OpenGL: the driver crashed (signal {-probe.returncode})"
+    return False, (probe.stderr.strip().splitlines() or ["OpenGL: the probe failed"])[-1]
+
+
+def is_software(renderer: str) -> bool:
+    """Whether a renderer string names a driver that draws on the CPU."""
+    return any(name in renderer.lower() for name in ("llvmpipe", "softpipe", "swrast"))
+
+
+def open_context(device_index: int) -> moderngl.Context:
+    """A context on an EGL device, current in this thread; the caller releases it.
+
+    device_index : in the order of EGL, which is not that of CUDA; GLCONTEXT_DEVICE_INDEX in the environment wins.
+    Raises DeviceError: moderngl or a library is missing, no such device, or OpenGL is older than 4.3.
+    """
+    _check_installed()
+    import moderngl
+
+    settings: dict[str, Any] = {"backend": "egl", "device_index": device_index, **_LIBRARIES}
+    try:
+        return moderngl.create_context(require=_VERSION, standalone=True, **settings)
+    except Exception as error:  # the binding raises bare Exception
+        index = os.environ.get("GLCONTEXT_DEVICE_INDEX", device_index)
+        raise DeviceError(f"OpenGL: no OpenGL 4.3 on EGL device {index}: {error}") from error
+
+
+def storage_limit(context: moderngl.Context) -> int:
+    """Bytes of the largest storage block. A driver whose limit overflows the query's 32 bits gets 2³¹ − 1."""
+    limit = context.info["GL_MAX_SHADER_STORAGE_BLOCK_SIZE"]
+    return limit if limit > 0 else 2**31 - 1
+
+
+def check_errors(context: moderngl.Context, doing: str) -> None:
+    """Raise DeviceError if OpenGL flagged an error since the last call: it raises nothing by itself."""
+    error = context.error
+    if error != "GL_NO_ERROR":
+        raise DeviceError(f"OpenGL: {error} while {doing} on {context.info['GL_RENDERER']}")
+
+
+def shader_source(*names: str, extensions: tuple[str, ...] = (), defines: tuple[str, ...] = ()) -> str:
+    """One GLSL source of the named files of ``shaders/`` behind its version, extensions and definitions."""
+    folder = files(str(__package__)) / "shaders"
+    lines = [f"#version {_VERSION}"]
+    lines += [f"#extension {name} : require" for name in extensions]
+    lines += [f"#define {name}" for name in defines]
+    return "\n".join(lines + [(folder / f"{name}.glsl").read_text(encoding="utf-8") for name in names])
+
+
+def _check_installed() -> None:
+    if find_spec("moderngl") is None:
+        raise DeviceError("OpenGL: moderngl is not installed; pip install 'splatpipe[gl]'")
+    for library in _LIBRARIES.values():
+        try:
+            ctypes.CDLL(library)
+        except OSError:
+            raise DeviceError(
+                f"OpenGL: {library} is missing; on Debian or Ubuntu: apt install libegl1 libgl1 libgl1-mesa-dri"
+            ) from None
+
+
+def _probe() -> int:
+    try:
+        with open_context(0) as context:
+            print(context.info["GL_RENDERER"])
+    except DeviceError as error:
+        print(error, file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(_probe())
