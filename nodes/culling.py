@@ -20,9 +20,6 @@ _PLANES = np.uint8((1 << N_PLANES) - 1)
 _CONE = np.uint8(1 << N_PLANES)
 _OUTSIDE = np.uint8(1 << 7)
 
-_CUBE_SLACK = 2.0**-22
-"""Cubes grow by this share of the root edge: a stored float32 position may lie just outside its cell, and the
-rasterizer's depth is rounded too."""
 _CONE_SLACK = 1e-6
 """Cosines shrink by this much: cones are float32, and near one a rounded cosine is a large angle off."""
 
@@ -40,7 +37,7 @@ class CullingNode:
         self._centers = octree.centers
         self._level = octree.level
         self._parent = octree.parent
-        self._half_edge = np.ldexp(octree.edge, -np.arange(MAX_LEVEL + 1) - 1) + octree.edge * _CUBE_SLACK
+        self._half_edge = padded_half_edges(octree)
         use_cone = backface and octree.cone is not None
         self._cone = octree.cone if use_cone else np.empty((0, 4), np.float32)
         self._undecided = np.empty(len(octree), np.uint8)
@@ -64,6 +61,17 @@ class CullingNode:
             self._undecided,
         )
         return VisibilityBits.pack(camera.frame, self._undecided != _OUTSIDE)
+
+
+def padded_half_edges(octree: Octree) -> np.ndarray:
+    """(MAX_LEVEL + 1,) float64 half edge of the cubes of each level, grown to hold what rounding moves out of them.
+
+    Stored float32 positions may lie outside their cell by a rounding of the root edge, centres and world coordinates by
+    one of the largest coordinate; and the rasterizer rounds depth.
+    """
+    half = np.ldexp(octree.edge, -np.arange(MAX_LEVEL + 1) - 1)
+    largest = np.abs(octree.origin).max() + octree.edge
+    return half * (1 + 2.0**-20) + octree.edge * 2.0**-22 + 4 * np.spacing(largest)
 
 
 def frustum_planes(camera: Camera, margin_px: float) -> np.ndarray:

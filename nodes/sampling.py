@@ -64,6 +64,8 @@ class SamplingNode:
                 f"visibility bits: found frame {bits.frame} of {bits.n_cells} cells,"
                 f" expected frame {camera.frame} of {len(tree)}"
             )
+        visible = bits.bits.view()
+        visible.flags.writeable = False  # received or fresh, one type to the compiler
         n_cut = _cut(
             tree.centers,
             tree.level,
@@ -73,7 +75,7 @@ class SamplingNode:
             tree.n_points,
             tree.n_below,
             self._edge,
-            bits.bits,
+            visible,
             camera.eye,
             camera.near,
             camera.focal_px,

@@ -18,7 +18,7 @@ from .errors import ConfigError
 
 if TYPE_CHECKING:
     from .config import CameraSection
-    from .store import SceneInfo
+    from .scene_info import SceneInfo
 
 NEAR_SHARE = 1e-4
 """Default near plane as a share of the scene's radius: reversed depth does not suffer from a small one, and a camera

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers_octree import build_cloud, leaf_of_points, scenes
 from hypothesis import given, settings
-from splatpipe.nodes.culling import CullingNode
+from splatpipe.nodes.culling import CullingNode, padded_half_edges
 from splatpipe.shared.camera import look_at, perspective_camera
 
 EXAMPLES = settings(max_examples=150, derandomize=True, deadline=None)
@@ -29,7 +29,7 @@ def cull_twin(octree, camera, *, backface, margin_px):
         if cell and not visible[octree.parent[cell]]:
             continue
         center = octree.centers[cell] - camera.eye
-        half = octree.half_edges[cell] + octree.edge * 2.0**-22
+        half = padded_half_edges(octree)[octree.level[cell]]
         corners = center + half * signs
         outside = (corners @ w < camera.near).all() or any((corners @ side < 0).all() for side in sides)
         distance, radius = np.linalg.norm(center), half * 3**0.5

@@ -1,0 +1,252 @@
+"""Colour: which colour a stored point has, and what a framebuffer looks like as an image.
+
+Everything ends in colour words (``points.pack_rgb``). Scalars go through a matplotlib colour map of 256 entries,
+imported when one is used.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from .camera_path import up_vector
+from .errors import ConfigError
+from .messages import FRAMEBUFFER_EMPTY
+from .points import pack_rgb, unpack_normals
+from .store import Scene
+
+MODES = ("auto", "rgb", "intensity", "elevation", "classification", "level", "normal")
+_COLOUR_MAPPED = ("intensity", "elevation", "level")
+_CHUNK = 1 << 18
+_SAMPLE = 1 << 14
+_PERCENTILES = (2.0, 98.0)
+
+CLASS_COLOURS = {
+    0: "#9e9e9e",  # created, never classified
+    1: "#bdbdbd",  # unclassified
+    2: "#a67c52",  # ground
+    3: "#c5e1a5",  # low vegetation
+    4: "#7cb342",  # medium vegetation
+    5: "#33691e",  # high vegetation
+    6: "#d84f3f",  # building
+    7: "#ff00ff",  # low point (noise)
+    8: "#8d99ae",  # model key point / reserved
+    9: "#3f8fd2",  # water
+    10: "#6d4c41",  # rail
+    11: "#616161",  # road surface
+    12: "#8e9aaf",  # overlap / reserved
+    13: "#fdd835",  # wire, guard
+    14: "#ffb300",  # wire, conductor
+    15: "#5e35b1",  # transmission tower
+    16: "#fb8c00",  # wire-structure connector
+    17: "#90a4ae",  # bridge deck
+    18: "#ff4dff",  # high noise
+}
+"""Colours of the ASPRS classes (LAS 1.4 R15, table 17)."""
+_OTHER_CLASS = "#00bcd4"  # 19–255: reserved and user-defined
+
+
+@dataclass(frozen=True)
+class Colouring:
+    """How the points of a scene are coloured; made and checked by ``choose``.
+
+    mode : one of ``MODES`` but ``auto``, or ``constant``.
+    attribute : the attribute it reads, or None.
+    colormap : of the scalar modes.  value_range : values at its two ends; None: found from the points.
+    word : the colour of mode ``constant``.
+    """
+
+    mode: str
+    attribute: str | None
+    colormap: str
+    value_range: tuple[float, float] | None
+    word: np.uint32
+
+    @classmethod
+    def choose(
+        cls, scene: Scene, mode: str, colormap: str = "viridis", value_range: tuple[float, float] | None = None
+    ) -> Colouring:
+        """The colouring that a configuration asks for.
+
+        ``auto`` takes the first that tells something: rgb, then normal, then intensity, then elevation; an attribute
+        with one value everywhere tells nothing.
+
+        Raises ConfigError for an unknown mode or colour map, an attribute the scene lacks, or an empty range.
+        """
+        word = np.uint32(0)
+        if mode == "auto":
+            telling = (name for name in ("rgb", "normal", "intensity") if _varies(scene, name))
+            mode = next(telling, "elevation")
+        elif mode.startswith("#"):
+            word, mode = parse_colour(mode, "render.colour").view("<u4")[0], "constant"
+        elif mode not in MODES:
+            raise ConfigError(f"render.colour = {mode!r}, expected one of {', '.join(MODES)} or #rrggbb")
+        attribute = mode if mode in ("rgb", "intensity", "classification", "normal") else None
+        if attribute is not None and attribute not in scene.info.attributes:
+            found = ", ".join(scene.info.attributes) or "no attribute"
+            raise ConfigError(f"render.colour = {mode!r}: the scene has {found}; auto takes what there is")
+        if value_range is not None and not (all(map(math.isfinite, value_range)) and value_range[0] != value_range[1]):
+            raise ConfigError(f"render.colour_range = {list(value_range)}, expected two different numbers")
+        if mode in _COLOUR_MAPPED:
+            _colormap(colormap)
+        return cls(mode, attribute, colormap, value_range, word)
+
+
+def colour_words(scene: Scene, colouring: Colouring) -> np.ndarray:
+    """(n_stored,) uint32 colour words of a scene's points.
+
+    Cost: one read of the attribute; memory 4 bytes a point (none for rgb, whose stored column is mapped).
+    """
+    n = scene.info.n_stored
+    match colouring.mode:
+        case "rgb":
+            return scene.attribute("rgb")
+        case "constant":
+            return np.full(n, colouring.word, "<u4")
+        case "classification":
+            palette = _class_palette()
+            codes = scene.attribute("classification")
+            return _by_chunk(n, lambda part: palette[codes[part]])
+        case "normal":
+            normals, up = scene.attribute("normal"), up_vector(scene.info)
+            return _by_chunk(n, lambda part: shade(unpack_normals(normals[part]), up))
+        case mode:
+            values = _scalars(scene, mode)
+            low, high = colouring.value_range or _robust_range(values, n)
+            table = _colormap(colouring.colormap)
+            return _by_chunk(n, lambda part: map_scalars(values(part), low, high, table))
+
+
+def map_scalars(values: np.ndarray, low: float, high: float, table: np.ndarray) -> np.ndarray:
+    """(n,) uint32 words of (n,) values: ``table`` (256,) from low to high, clamped; not a number: its first colour.
+
+    Where low equals high, the table's middle colour.
+    """
+    if low == high:
+        return np.full(len(values), table[len(table) // 2])
+    share = (values.astype(np.float64) - low) * (1.0 / (high - low))
+    index = np.clip(np.nan_to_num(share, nan=0.0, posinf=1.0, neginf=0.0), 0.0, 1.0) * (len(table) - 1)
+    return table[np.rint(index).astype(np.uint8)]
+
+
+def shade(normals: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """(n,) uint32 words of a clay model lit from above, from (n, 3) float32 unit normals.
+
+    A soft key light stands 45° up at one side, a dim cool one opposite. Light does not depend on the normal's sign
+    (two-sided: scans do not always know it) except for a third of the key. A point without a normal is mid-grey.
+    """
+    side = np.roll(np.abs(up), 1)
+    key = (side + 0.6 * np.cross(up, side) + 1.2 * up).astype(np.float32)
+    key /= np.linalg.norm(key)
+    fill = np.cross(key, side.astype(np.float32))
+    fill /= np.linalg.norm(fill)
+    toward_key = normals @ key
+    lit = 0.18 + 0.47 * np.abs(toward_key) + 0.25 * np.maximum(toward_key, 0.0)
+    cool = 0.10 * np.abs(normals @ fill)
+    lit[~normals.any(axis=1)] = 0.5
+    channels = [lit * warm + cool * tint for warm, tint in ((1.0, 0.8), (0.955, 0.9), (0.89, 1.2))]
+    return pack_rgb(*(np.rint(np.minimum(c, 1.0) * 255).astype(np.uint8) for c in channels))
+
+
+def parse_colour(text: str, key: str) -> np.ndarray:
+    """(4,) uint8 RGBA of ``#rrggbb``, ``transparent`` or a colour name. Raises ConfigError naming ``key``."""
+    from PIL import ImageColor
+
+    if text == "transparent":
+        return np.zeros(4, np.uint8)
+    try:
+        return np.array((*ImageColor.getrgb(text)[:3], 255), np.uint8)
+    except ValueError:
+        raise ConfigError(f"{key} = {text!r}, expected #rrggbb, transparent or a colour name") from None
+
+
+def frame_to_rgba(words: np.ndarray, background: np.ndarray) -> np.ndarray:
+    """(h, w, 4) uint8 image of (h, w) uint64 framebuffer words; (4,) uint8 ``background`` where no point fell.
+
+    Cost: one pass, 12 bytes a pixel.
+    """
+    image = words.astype("<u4")  # keeps the low half, the colour
+    image[words == FRAMEBUFFER_EMPTY] = background.view("<u4")[0]
+    return image.view(np.uint8).reshape(*words.shape, 4)
+
+
+# --- what the modes read ----------------------------------------------------------------------------------------
+
+_Part = slice | np.ndarray
+"""Which stored points: a slice with both ends, or ascending indices."""
+
+
+def _scalars(scene: Scene, mode: str) -> Callable[[_Part], np.ndarray]:
+    """The values of a scalar mode, part by part."""
+    if mode == "intensity":
+        column = scene.attribute("intensity")
+        return lambda part: column[part]
+    if mode == "elevation":
+        up = up_vector(scene.info)
+        axis = int(np.abs(up).argmax())
+        sign, column = up[axis], scene.positions()[axis]
+        first, origin = scene.blocks()
+        return lambda part: sign * (column[part] + origin[_owner(first, part), axis])
+    octree = scene.octree()
+    owners = np.arange(len(octree)) if octree.point_order == "layered" else np.flatnonzero(octree.is_leaf)
+    owners = owners[np.argsort(octree.first_point[owners])]
+    first = octree.first_point[owners]
+    return lambda part: octree.level[owners[_owner(first, part)]]
+
+
+def _owner(first: np.ndarray, part: _Part) -> np.ndarray:
+    """(n,) index of the range that holds each point, of ranges that start at ascending ``first``."""
+    index = np.arange(part.start, part.stop) if isinstance(part, slice) else part
+    return np.searchsorted(first, index, side="right") - 1
+
+
+def _by_chunk(n: int, words: Callable[[slice], np.ndarray]) -> np.ndarray:
+    """(n,) uint32 words, made a bounded number at a time."""
+    out = np.empty(n, "<u4")
+    for start in range(0, n, _CHUNK):
+        part = slice(start, min(start + _CHUNK, n))
+        out[part] = words(part)
+    return out
+
+
+def _sample(n: int) -> np.ndarray:
+    """Ascending indices of at most ``_SAMPLE`` of n points, always the same."""
+    return np.arange(n) if n <= _SAMPLE else np.unique(np.random.default_rng(0).integers(0, n, _SAMPLE))
+
+
+def _varies(scene: Scene, name: str) -> bool:
+    """Whether the scene has the attribute with more than one value."""
+    if name not in scene.info.attributes:
+        return False
+    values = scene.attribute(name)[_sample(scene.info.n_stored)]
+    return bool((values != values[0]).any())
+
+
+def _robust_range(values: Callable[[_Part], np.ndarray], n: int) -> tuple[float, float]:
+    """The 2nd and 98th percentile of a sample of the finite values; (0, 0) where there are none."""
+    sample = np.asarray(values(_sample(n)), np.float64)
+    finite = sample[np.isfinite(sample)]
+    if not len(finite):
+        return 0.0, 0.0
+    low, high = np.percentile(finite, _PERCENTILES)
+    return float(low), float(high)
+
+
+def _class_palette() -> np.ndarray:
+    """(256,) uint32 colour word of each class code."""
+    colours = np.array([parse_colour(CLASS_COLOURS.get(code, _OTHER_CLASS), "class") for code in range(256)])
+    return colours.view("<u4").ravel()
+
+
+def _colormap(name: str) -> np.ndarray:
+    """(256,) uint32 words of a matplotlib colour map. Raises ConfigError with near names for an unknown one."""
+    from matplotlib import colormaps
+
+    if name not in colormaps:
+        near = ", ".join(difflib.get_close_matches(name, list(colormaps), n=3, cutoff=0.0))
+        raise ConfigError(f"render.colormap = {name!r}, expected a matplotlib colour map such as {near}")
+    return np.ascontiguousarray(colormaps[name](np.linspace(0.0, 1.0, 256), bytes=True)).view("<u4").ravel()
