@@ -202,6 +202,11 @@ class TestOnDevice:
             with pytest.raises(InputError, match=f"viewport: found {width}×{HEIGHT}"):
                 rasterizer(points, width, HEIGHT)
 
+    @BOTH
+    def test_points_take_16_bytes_each(self, points, rasterizer):
+        with rasterizer(points, WIDTH, HEIGHT) as ours:
+            assert ours.resident_bytes == 16 * N_POINTS
+
     def test_a_frame_above_the_storage_limit_is_refused(self, points, monkeypatch):
         monkeypatch.setattr(gl, "storage_limit", lambda _: 1 << 24)
         with pytest.raises(DeviceError, match="found 33554432 bytes of framebuffer, expected at most 16777216"):
@@ -239,11 +244,11 @@ def fresh_probe():
 @pytest.mark.usefixtures("fresh_probe")
 class TestAvailability:
     def test_names_the_missing_package(self, monkeypatch):
-        monkeypatch.setitem(gl_context._LIBRARIES, "libegl", "libNoSuchEGL.so.1")
+        monkeypatch.setattr(gl_context, "_LIBRARY", "libNoSuchEGL.so.1")
         available, reason = gl_available()
         assert not available
         assert "libNoSuchEGL.so.1 is missing" in reason
-        assert "apt install libegl1" in reason
+        assert "apt install libegl1 libgl1-mesa-dri" in reason
 
     def test_names_the_missing_extra(self, monkeypatch):
         monkeypatch.setattr(gl_context, "find_spec", lambda _: None)

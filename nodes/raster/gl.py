@@ -83,6 +83,11 @@ class _GlRasterizer(ABC):
         """Release the context and with it all device memory. May be called twice."""
         self._context.release()
 
+    @property
+    def resident_bytes(self) -> int:
+        """Device memory that the point-array takes."""
+        return sum(column.size for chunk in self._chunks for column in chunk)
+
     def draw(self, camera: Camera, entries: np.ndarray) -> np.ndarray:
         """(height, width) uint64 framebuffer words, row 0 on top; valid until the next call.
 

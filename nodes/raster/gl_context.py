@@ -19,7 +19,7 @@ from ...shared.errors import DeviceError
 if TYPE_CHECKING:
     import moderngl
 
-_LIBRARIES = {"libegl": "libEGL.so.1", "libgl": "libGL.so.1"}
+_LIBRARY = "libEGL.so.1"
 _VERSION = 430  # compute shaders and storage buffers
 _PROBE_S = 60
 
@@ -58,7 +58,9 @@ def open_context(device_index: int) -> moderngl.Context:
     _check_installed()
     import moderngl
 
-    settings: dict[str, Any] = {"backend": "egl", "device_index": device_index, **_LIBRARIES}
+    # EGL hands out the functions of OpenGL as well, so libGL, which comes with X, is not needed
+    libraries = {"libegl": _LIBRARY, "libgl": _LIBRARY}
+    settings: dict[str, Any] = {"backend": "egl", "device_index": device_index, **libraries}
     try:
         return moderngl.create_context(require=_VERSION, standalone=True, **settings)
     except Exception as error:  # the binding raises bare Exception
@@ -91,13 +93,12 @@ def shader_source(*names: str, extensions: tuple[str, ...] = (), defines: tuple[
 def _check_installed() -> None:
     if find_spec("moderngl") is None:
         raise DeviceError("OpenGL: moderngl is not installed; pip install 'splatpipe[gl]'")
-    for library in _LIBRARIES.values():
-        try:
-            ctypes.CDLL(library)
-        except OSError:
-            raise DeviceError(
-                f"OpenGL: {library} is missing; on Debian or Ubuntu: apt install libegl1 libgl1 libgl1-mesa-dri"
-            ) from None
+    try:
+        ctypes.CDLL(_LIBRARY)
+    except OSError:
+        raise DeviceError(
+            f"OpenGL: {_LIBRARY} is missing; on Debian or Ubuntu: apt install libegl1 libgl1-mesa-dri"
+        ) from None
 
 
 def _probe() -> int:
