@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
 
 from ..nodes.culling import CullingNode
 from ..nodes.raster import PointSize
-from ..nodes.render import RenderNode, load_points, make_rasterizer
+from ..nodes.raster.choose import make_rasterizer
+from ..nodes.render import RenderNode, load_points
 from ..nodes.sampling import SamplingNode
 from ..shared.camera import Camera
 from ..shared.camera_path import camera_path
@@ -64,21 +65,24 @@ class Job:
         points = load_points(self.scene, self.colouring, verify=self.config.scene.verify)
         render, output = self.config.render, self.config.output
         camera = self.config.camera
-        with make_rasterizer(
-            render.rasterizer, points, camera.width, camera.height, self.point_size, render.threads or None
-        ) as rasterizer:
-            progress("compiling kernels (kept for the next run)", 0)
-            rasterizer.warm_up()
+        with ExitStack() as stack:
+            rasterizer = stack.enter_context(
+                make_rasterizer(
+                    render.rasterizer, points, camera.width, camera.height, self.point_size, render.threads or None
+                )
+            )
+            node = RenderNode(rasterizer)
+            progress("compiling kernels (once; kept for the next run)", 0)
+            node.warm_up(self.camera(0))
+            sink = None
             if output.png or output.mp4:
-                with FrameSink(self.output, png=output.png, mp4=output.mp4, fps=output.fps) as sink:
-                    yield RenderStage(RenderNode(rasterizer), sink, self.background)
-            else:
-                yield RenderStage(RenderNode(rasterizer), None, self.background)
+                sink = stack.enter_context(FrameSink(self.output, png=output.png, mp4=output.mp4, fps=output.fps))
+            yield RenderStage(node, sink, self.background)
 
     @property
     def attributes_read(self) -> set[str]:
         """Attributes of the scene that this run reads."""
-        return {self.colouring.attribute} | ({"normal"} if self.backface else set())
+        return {name for name in (self.colouring.attribute, "normal" if self.backface else None) if name}
 
     def outputs(self) -> list[str]:
         """What the run has written, for people."""
