@@ -1,11 +1,12 @@
 """Buildings: façades from repeated modules, roofs, and what stands on them.
 
-Local frame of a building: its front is the plane y = 0, seen from negative y; x to the right, y into the depth, z up from
-the ground floor. ``MODULE_M`` is the width of one bay of a façade; every width is a multiple of it.
+Local frame of a building: its front is the plane y = 0, seen from negative y; x to the right, y into the depth, z up
+from the ground floor. ``MODULE_M`` is the width of one bay of a façade; every width is a multiple of it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
@@ -29,6 +30,7 @@ from .primitives import (
 MODULE_M = 3.0
 FLOOR_M = 3.2
 ROW_DEPTH_M = 12.0
+ROOF_SLOPE = 0.95
 
 FACADES: tuple[Colour, ...] = (
     (0.91, 0.83, 0.66), (0.88, 0.71, 0.52), (0.80, 0.52, 0.41), (0.93, 0.90, 0.83), (0.74, 0.78, 0.74),
@@ -81,11 +83,12 @@ def balcony() -> np.ndarray:
     return join(opening(1.8, 2.3, 0.0, FLOOR_M), slab, painted(rail, {Material.PAINT: (0.55, 0.60, 0.62)}))
 
 
-def facade(bays: int, floors: int, ground: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """A front of bays × floors on y = 0: ``ground`` on the lowest, ``upper`` above."""
-    x, z = np.meshgrid(np.arange(bays) * MODULE_M, np.arange(floors) * FLOOR_M)
-    offsets = np.column_stack([x.ravel(), np.zeros(x.size), z.ravel()])
-    return join(moved(ground, offsets[:bays]), moved(upper, offsets[bays:]))
+def facade(ground: Sequence[np.ndarray], floors: int, upper: np.ndarray) -> np.ndarray:
+    """A front on y = 0: one bay after another of ``ground``, and rows of ``upper`` above."""
+    x = np.arange(len(ground)) * MODULE_M
+    x_upper, z_upper = (v.ravel() for v in np.meshgrid(x, np.arange(1, floors) * FLOOR_M))
+    lowest = [moved(bay, (at, 0, 0)) for bay, at in zip(ground, x, strict=True)]
+    return join(*lowest, moved(upper, np.column_stack([x_upper, 0 * x_upper, z_upper])))
 
 
 def around(part_by_side: list[np.ndarray], width: float, depth: float) -> np.ndarray:
@@ -133,32 +136,26 @@ def chimney() -> np.ndarray:
 
 @cache
 def dormer() -> np.ndarray:
-    """A dormer with a window, for a slope of one in one that passes through its foot."""
-    front = moved(opening(1.0, 1.1, 0.3, 1.6, module=1.5), (0, 0, 0))
-    cheek = triangle(Material.WALL, (0, 1.6, 1.6), (0, 0, 0), (0, 0, 1.6))
-    other = triangle(Material.WALL, (1.5, 0, 0), (1.5, 1.6, 1.6), (1.5, 0, 1.6))
-    return join(front, cheek, other, box(Material.METAL, (-0.15, -0.2, 1.6), (1.65, 1.7, 1.72), "xXyZ"))
+    """A dormer with a window, for a roof of ``ROOF_SLOPE`` that passes through its foot."""
+    width, tall = 1.5, 1.6
+    depth = tall / ROOF_SLOPE
+    return join(
+        opening(1.0, 1.1, 0.3, tall, module=width),
+        triangle(Material.WALL, (0, depth, tall), (0, 0, 0), (0, 0, tall)),
+        triangle(Material.WALL, (width, 0, 0), (width, depth, tall), (width, 0, tall)),
+        box(Material.METAL, (-0.15, -0.2, tall), (width + 0.15, depth + 0.1, tall + 0.12), "xXyZ"),
+    )
 
 
 def row_house(rng: np.random.Generator, bays: int, low_left: float, low_right: float, floors: int) -> np.ndarray:
     """A town house in a row; side walls start above the neighbours' eaves."""
     width, depth, eaves = bays * MODULE_M, ROW_DEPTH_M, floors * FLOOR_M
-    rise = depth / 2 * 0.95
-    if rng.random() < 0.35:
-        ground = opening(2.4, 2.5, 0.25, FLOOR_M)
-    else:
-        ground = window()
-    upper = balcony() if rng.random() < 0.25 else window()
-    front = facade(bays, floors, ground, upper)
-    at = int(rng.integers(bays)) * MODULE_M
-    is_entrance = (
-        (front["origin"][:, 0] >= at)
-        & (front["origin"][:, 0] < at + MODULE_M)
-        & (front["origin"][:, 2] < FLOOR_M - 0.2)
-    )
-    entrance = moved(opening(1.3, 2.4, 0.0, FLOOR_M, Material.DOOR), (at, 0, 0))
-    front = join(front[~is_entrance], entrance)
-    back = moved(turned(facade(bays, floors, window(), window()), 2), (width, depth, 0))
+    rise = depth / 2 * ROOF_SLOPE
+    shop = rng.random() < 0.35
+    ground = [opening(2.4, 2.5, 0.25, FLOOR_M) if shop else window()] * bays
+    ground[rng.integers(bays)] = opening(1.3, 2.4, 0.0, FLOOR_M, Material.DOOR)
+    front = facade(ground, floors, balcony() if rng.random() < 0.25 else window())
+    back = moved(turned(facade([window()] * bays, floors, window()), 2), (width, depth, 0))
     sides = []
     if low_left < eaves:
         sides.append(rectangle(Material.WALL, (0, depth, low_left), (0, -depth, 0), (0, 0, eaves - low_left)))
@@ -166,9 +163,8 @@ def row_house(rng: np.random.Generator, bays: int, low_left: float, low_right: f
         sides.append(rectangle(Material.WALL, (width, 0, low_right), (0, depth, 0), (0, 0, eaves - low_right)))
     roof = [gable_roof(width, depth, eaves, rise), moved(chimney(), (width - 1.6, depth / 2 - 0.3, eaves + rise - 0.8))]
     if rng.random() < 0.6:
-        slope = 0.95
         xs = np.arange(bays) * MODULE_M + (MODULE_M - 1.5) / 2
-        roof.append(moved(dormer(), np.column_stack([xs, np.full(bays, 1.2), np.full(bays, eaves + 1.2 * slope)])))
+        roof.append(moved(dormer(), np.column_stack([xs, np.full(bays, 1.2), np.full(bays, eaves + 1.2 * ROOF_SLOPE)])))
     house = join(front, back, *sides, *roof, cornice(width, eaves), cornice(width, FLOOR_M + 0.1))
     return painted(
         house,
@@ -224,21 +220,20 @@ def office(bays: int, deep: int, floors: int, colour: Colour) -> np.ndarray:
     bay = opening(2.5, 2.0, 0.8, FLOOR_M)
     entrance = opening(2.7, 2.7, 0.05, FLOOR_M)
     width, depth = bays * MODULE_M, deep * MODULE_M
-    sides = [facade(n, floors, entrance, bay) for n in (bays, deep, bays, deep)]
+    sides = [facade([entrance] * n, floors, bay) for n in (bays, deep, bays, deep)]
     return painted(
         join(around(sides, width, depth), flat_roof(width, depth, floors * FLOOR_M)), {Material.WALL: colour}
     )
 
 
 def apartments(bays: int, floors: int, colour: Colour) -> np.ndarray:
-    """A slab of flats: every other bay of the front and the back has a balcony."""
+    """A slab of flats: every other bay of the front and the back has a balcony. ``bays`` is even."""
+    entrance = opening(1.4, 2.4, 0, FLOOR_M, Material.DOOR)
     pair = join(window(), moved(balcony(), (MODULE_M, 0, 0)))
-    ground = join(window(), moved(opening(1.4, 2.4, 0, FLOOR_M, Material.DOOR), (MODULE_M, 0, 0)))
-    x, z = np.meshgrid(np.arange(bays // 2) * 2 * MODULE_M, np.arange(floors) * FLOOR_M)
-    offsets = np.column_stack([x.ravel(), 0 * x.ravel(), z.ravel()])
-    front = join(moved(ground, offsets[: bays // 2]), moved(pair, offsets[bays // 2 :]))
-    width, depth = bays // 2 * 2 * MODULE_M, 4 * MODULE_M
-    side = facade(4, floors, window(), window())
+    x, z = (v.ravel() for v in np.meshgrid(np.arange(0, bays, 2) * MODULE_M, np.arange(1, floors) * FLOOR_M))
+    front = join(facade([window(), entrance] * (bays // 2), 1, window()), moved(pair, np.column_stack([x, 0 * x, z])))
+    width, depth = bays * MODULE_M, 4 * MODULE_M
+    side = facade([window()] * 4, floors, window())
     return painted(
         join(around([front, side, front, side], width, depth), flat_roof(width, depth, floors * FLOOR_M)),
         {Material.WALL: colour},
@@ -248,7 +243,7 @@ def apartments(bays: int, floors: int, colour: Colour) -> np.ndarray:
 def cottage(rng: np.random.Generator) -> np.ndarray:
     """A detached house of 4 × 3 bays and two floors with a hipped roof and a porch."""
     width, depth, eaves = 4 * MODULE_M, 3 * MODULE_M, 2 * FLOOR_M
-    sides = [facade(n, 2, window(), window()) for n in (4, 3, 4, 3)]
+    sides = [facade([window()] * n, 2, window()) for n in (4, 3, 4, 3)]
     porch = join(
         box(Material.TRIM, (4.6, -1.6, 2.5), (7.4, -0.01, 2.7), "xXyzZ"),
         *(frustum(Material.TRIM, (x, -1.45, 0), 0.1, (0, 0, 2.5)) for x in (4.8, 7.2)),
@@ -276,14 +271,16 @@ def church() -> np.ndarray:
     body = moved(join(around([side, end, side, end], nave, depth), gable_roof(nave, depth, eaves, 8.5)), (x0, 0, 0))
     w, top = 9.0, 28.0
     belfry = opening(1.2, 4.0, 3.0, 8.0)
-    plain = rectangle(Material.WALL, (0, 0, 0), (w, 0, 0), (0, 0, 20))
-    face = disc(Material.MARKING, (w / 2, -0.06, 17), (1.3, 0, 0), (0, 0, 1.3))
-    face["material"] = Material.TRIM
-    hands = box(Material.METAL, (w / 2 - 0.06, -0.1, 17), (w / 2 + 0.06, -0.07, 18.1), "y")
-    wall = join(plain, *(moved(belfry, (k * MODULE_M, 0, 20)) for k in range(3)), face, hands)
-    wall = join(wall, cornice(w, 20), cornice(w, top))
+    high = join(
+        *(moved(belfry, (k * MODULE_M, 0, 20)) for k in range(3)),
+        disc(Material.TRIM, (w / 2, -0.06, 17), (1.3, 0, 0), (0, 0, 1.3)),
+        box(Material.METAL, (w / 2 - 0.06, -0.1, 17), (w / 2 + 0.06, -0.07, 18.1), "y"),
+        cornice(w, 20),
+        cornice(w, top),
+    )
+    wall = join(rectangle(Material.WALL, (0, 0, 0), (w, 0, 0), (0, 0, 20)), high)
     portal = opening(3.0, 4.5, 0.2, 6.0, Material.DOOR, module=w)
-    portal = join(portal, rectangle(Material.WALL, (0, 0, 6), (w, 0, 0), (0, 0, 14)), wall[1:])
+    portal = join(portal, rectangle(Material.WALL, (0, 0, 6), (w, 0, 0), (0, 0, 14)), high)
     spire = primitive(
         Shape.FRUSTUM, Material.ROOF, (w / 2, w / 2, top), (w * 0.52, 0, 0), (0, w * 0.52, 0), (0, 0, 17), 0.02
     )

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -33,7 +34,6 @@ from .terrain import BLOCK_M, DISTRICT, PITCH_M, STREET_M, height
 
 PAVEMENT_M = 3.0
 KERB_M = 0.12
-_TILE_M = 6.0
 
 Rectangle = tuple[float, float, float, float]
 """x0, y0, x1, y1 in metres."""
@@ -57,8 +57,8 @@ def open_ground(area: Rectangle, footprints: list[Rectangle], material: Material
     xs = np.unique([area[0], area[2], *(x for f in footprints for x in (f[0], f[2]))])
     ys = np.unique([area[1], area[3], *(y for f in footprints for y in (f[1], f[3]))])
     out = []
-    for x0, x1 in zip(xs[:-1], xs[1:], strict=True):
-        for y0, y1 in zip(ys[:-1], ys[1:], strict=True):
+    for x0, x1 in pairwise(xs):
+        for y0, y1 in pairwise(ys):
             x, y = (x0 + x1) / 2, (y0 + y1) / 2
             if not any(f[0] < x < f[2] and f[1] < y < f[3] for f in footprints):
                 out.append(rectangle(material, (x0, y0, z), (x1 - x0, 0, 0), (0, y1 - y0, 0)))
@@ -141,7 +141,7 @@ def church_block(rng: np.random.Generator) -> Contents:
 def park_block(rng: np.random.Generator) -> Contents:
     """A park with a pond; it brings its own ground."""
     a, b = PAVEMENT_M, BLOCK_M - PAVEMENT_M
-    return Contents([moved(thing, (a, a, 0)) for thing in park(rng, b - a)], [(a, a, b, b)], Material.GRASS)
+    return Contents([moved(thing, (a, a, 0)) for thing in park(rng, b - a, KERB_M)], [(a, a, b, b)], Material.GRASS)
 
 
 BlockKind = Callable[[np.random.Generator], Contents]
@@ -248,4 +248,4 @@ def city(seed: int, n_blocks: int) -> np.ndarray:
         for i in range(n_blocks):
             kind = DISTRICT_PLAN[j % DISTRICT][i % DISTRICT]
             out += block(rng, kind, i * PITCH_M + STREET_M, j * PITCH_M + STREET_M)
-    return tiled(join(*out), _TILE_M)
+    return tiled(join(*out), largest_m=6.0, slimmest=8.0)

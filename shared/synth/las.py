@@ -8,19 +8,18 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputError
-from ..points import unpack_normals, unpack_rgb
+from ..points import unpack_rgb
 from .scan import CityScan
 
 _SCALE_M = 0.001
 _BATCH_POINTS = 1_000_000
-_NORMAL_DIMENSIONS = ("NormalX", "NormalY", "NormalZ")
 
 
 def write_las(source: CityScan, path: str | Path) -> None:
     """Write a scan as LAS 1.4, point format 7, compressed when the name ends in ``.laz``.
 
-    Positions are rounded to 1 mm, colours widened to 16 bits, normals kept as extra bytes ``NormalX``, ``NormalY``,
-    ``NormalZ``. The file appears under its name only when whole.
+    Positions are rounded to 1 mm, colours widened to 16 bits; LAS has no field for normals. The file appears under
+    its name only when whole.
     Raises InputError for another ending or a folder that cannot be written.
     Cost: memory of one batch of a million points.
     """
@@ -31,8 +30,7 @@ def write_las(source: CityScan, path: str | Path) -> None:
         raise InputError(f"{path}: cannot write {path.suffix or 'a name without ending'}, expected .las or .laz")
     header = laspy.LasHeader(point_format=7, version="1.4")
     header.scales = np.full(3, _SCALE_M)
-    header.offsets = np.floor(source.info.lower)
-    header.add_extra_dims([laspy.ExtraBytesParams(name, np.float32) for name in _NORMAL_DIMENSIONS])
+    header.offsets = np.floor(np.asarray(source.info.lower))
     temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
     try:
         with laspy.open(temporary, "w", header=header) as writer:
@@ -41,8 +39,6 @@ def write_las(source: CityScan, path: str | Path) -> None:
                 record.x, record.y, record.z = batch.positions.T
                 rgb = unpack_rgb(batch.attributes["rgb"]).astype(np.uint16) * np.uint16(257)
                 record.red, record.green, record.blue = rgb[:, 0], rgb[:, 1], rgb[:, 2]
-                for name, values in zip(_NORMAL_DIMENSIONS, unpack_normals(batch.attributes["normal"]).T, strict=True):
-                    record[name] = values
                 record.intensity = batch.attributes["intensity"].astype(np.uint16)
                 record.classification = batch.attributes["classification"]
                 record.return_number = batch.attributes["return_number"]

@@ -5,6 +5,8 @@ The light is computed once from a height map of the city, and looked up per poin
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from .primitives import MATERIALS, Material
@@ -12,8 +14,8 @@ from .primitives import MATERIALS, Material
 SUN = np.array([-0.52, -0.62, 0.80]) / np.linalg.norm([-0.52, -0.62, 0.80])
 """Unit vector towards the sun, in the south-west."""
 
-_SUNLIGHT = np.array([0.86, 0.78, 0.64], np.float32)
-_SKYLIGHT = np.array([0.38, 0.43, 0.52], np.float32)
+_SUNLIGHT = np.array([0.84, 0.76, 0.63], np.float32)
+_SKYLIGHT = np.array([0.44, 0.49, 0.58], np.float32)
 _BOUNCE = np.array([0.12, 0.11, 0.10], np.float32)
 _SMALLEST_CELL_M = 0.4
 _MOST_CELLS = 2048
@@ -25,16 +27,17 @@ _TEXTURE = 256
 class Light:
     """Shadows and openness of the sky over a city.
 
-    positions : (3, n) float64, a sample of the city dense enough to hit every cell of 0.4 m.
+    survey : chunks of (3, n) float64 positions, together dense enough to hit every cell of 0.4 m.
     edge_m : the city's side, from 0.
+    Cost: memory of a few maps of at most 2048² cells.
     """
 
-    def __init__(self, positions: np.ndarray, edge_m: float, seed: int) -> None:
+    def __init__(self, survey: Iterable[np.ndarray], edge_m: float, seed: int) -> None:
         self.cell_m = max(_SMALLEST_CELL_M, edge_m / _MOST_CELLS)
         self._n = int(np.ceil(edge_m / self.cell_m))
-        x, y, z = positions
-        top = np.full(self._n * self._n, z.min(), np.float32)
-        np.maximum.at(top, self._cells(x, y), z.astype(np.float32))
+        top = np.full(self._n * self._n, -1.0, np.float32)
+        for x, y, z in survey:
+            np.maximum.at(top, self._cells(x, y), z.astype(np.float32))
         top = top.reshape(self._n, self._n)
         self._shadow = _shadow_tops(top, self.cell_m).ravel()
         self._skyline = _blurred(top, max(1, round(_SKY_RADIUS_M / self.cell_m))).ravel()

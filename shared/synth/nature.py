@@ -16,7 +16,6 @@ from .primitives import (
     join,
     moved,
     painted,
-    primitive,
     rectangle,
     triangle,
 )
@@ -33,16 +32,8 @@ def _specimen(species: int, scale: float) -> np.ndarray:
     if species == _CONIFER:
         trunk = frustum(Material.BARK, (0, 0, 0), 0.25 * scale, (0, 0, 3 * scale), 0.8)
         tiers = [
-            primitive(
-                Shape.FRUSTUM,
-                Material.LEAVES,
-                (0, 0, z * scale),
-                (r * scale, 0, 0),
-                (0, r * scale, 0),
-                (0, 0, 4.2 * scale),
-                0.1,
-            )
-            for z, r in ((1.4, 2.6), (3.8, 2.1), (6.2, 1.5))
+            blob(Material.LEAVES, (0, 0, z * scale), np.array([r, r, h]) * scale, Shape.FOLIAGE)
+            for z, r, h in ((2.6, 2.5, 1.5), (4.2, 2.1, 1.6), (5.8, 1.6, 1.7), (7.4, 1.1, 1.7), (8.8, 0.6, 1.5))
         ]
         return join(trunk, *tiers)
     tall, wide = ((5.0, 2.6), (6.2, 2.2), (4.4, 2.3))[species]
@@ -89,8 +80,8 @@ def bench() -> np.ndarray:
     )
 
 
-def park(rng: np.random.Generator, edge: float) -> list[np.ndarray]:
-    """Things in an edge × edge park: lawns about a pond in the middle, paths, trees and benches; and its ground.
+def park(rng: np.random.Generator, edge: float, z: float) -> list[np.ndarray]:
+    """Things in an edge × edge park: lawns about a pond, a path, trees and benches; and its ground at height z.
 
     The ground is fans of triangles between the shore, a path around it and the park's border, so no point of the lawn
     lies under the water.
@@ -111,7 +102,6 @@ def park(rng: np.random.Generator, edge: float) -> list[np.ndarray]:
             t for p, q, r, s in quads for t in (triangle(material, p, q, r), triangle(material, r, q, s))
         ]  # fmt: skip
 
-    z = 0.12
     water, bank = ring(shore, -0.45), ring(shore + 0.9, z)
     path0, path1, rim = ring(shore + 3.0, z), ring(shore + 5.2, z), ring(border, z)
     centre = (middle, middle, -0.45)

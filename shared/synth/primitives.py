@@ -13,7 +13,7 @@ from enum import IntEnum
 
 import numpy as np
 
-Vector = Sequence[float]
+Vector = Sequence[float] | np.ndarray
 Colour = tuple[float, float, float]
 
 
@@ -23,7 +23,7 @@ class Shape(IntEnum):
     RECTANGLE = 0  # a, b in [0, 1]; w is the unit normal u × v
     TRIANGLE = 1  # a + b ≤ 1; w as above
     DISC = 2  # a² + b² ≤ 1; w as above
-    FRUSTUM = 3  # side of a cone: radii u, v at the bottom and taper times that at the top; w is the axis
+    FRUSTUM = 3  # side of a cone: radii u, v at the bottom and taper times that at the top (≤ 1); w is the axis
     ELLIPSOID = 4  # half axes u, v, w
     FOLIAGE = 5  # the outer half of an ellipsoid, in clumps
 
@@ -57,8 +57,8 @@ class Surface:
     """How a material looks to a scanner.
 
     classification : ASPRS class.  colour : RGB in [0, 1] unless a part is painted otherwise.
-    weight : points per area relative to a wall.  grain, patches : relative colour variation from point to point, and over
-    a metre.  reflectance : in [0, 1], at the scanner's wavelength.  draped : lies on the terrain.
+    weight : points per area relative to a wall.  grain, patches : relative colour variation from point to point, and
+    over a metre.  reflectance : in [0, 1], at the scanner's wavelength.  draped : lies on the terrain.
     """
 
     classification: int
@@ -118,8 +118,11 @@ def primitive(
     if w is None:
         w = np.cross(u, v)
         w = w / np.linalg.norm(w)
-    row = (shape, material, tuple(origin), tuple(u), tuple(v), tuple(w), taper, MATERIALS[material].colour)
-    return np.array([row], PRIMITIVE)
+    out = np.empty(1, PRIMITIVE)
+    out["shape"], out["material"], out["taper"] = shape, material, taper
+    out["origin"], out["u"], out["v"], out["w"] = origin, u, v, w
+    out["colour"] = MATERIALS[material].colour
+    return out
 
 
 def rectangle(material: Material, origin: Vector, u: Vector, v: Vector) -> np.ndarray:
@@ -129,8 +132,7 @@ def rectangle(material: Material, origin: Vector, u: Vector, v: Vector) -> np.nd
 
 def triangle(material: Material, p: Vector, q: Vector, r: Vector) -> np.ndarray:
     """A triangle, counter-clockwise as seen from outside."""
-    p, q, r = np.asarray(p, float), np.asarray(q, float), np.asarray(r, float)
-    return primitive(Shape.TRIANGLE, material, p, q - p, r - p)
+    return primitive(Shape.TRIANGLE, material, p, np.subtract(q, p), np.subtract(r, p))
 
 
 def disc(material: Material, centre: Vector, u: Vector, v: Vector) -> np.ndarray:
@@ -140,7 +142,6 @@ def disc(material: Material, centre: Vector, u: Vector, v: Vector) -> np.ndarray
 
 def frustum(material: Material, base: Vector, radius: float, axis: Vector, taper: float = 1.0) -> np.ndarray:
     """The side of a cone or cylinder around ``axis``."""
-    axis = np.asarray(axis, float)
     side = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     u = side / np.linalg.norm(side) * radius
     v = np.cross(axis, u) / np.linalg.norm(axis)
@@ -199,21 +200,34 @@ def painted(part: np.ndarray, colours: Mapping[Material, Colour]) -> np.ndarray:
     return out
 
 
-def tiled(part: np.ndarray, largest_m: float) -> np.ndarray:
-    """A part with its rectangles cut into equal tiles with sides of at most ``largest_m``.
+def tiled(part: np.ndarray, largest_m: float, slimmest: float) -> np.ndarray:
+    """A part with its rectangles cut into equal tiles: no side above ``largest_m`` or ``slimmest`` times the other.
 
     Long patches would show the rows of the point sequence that covers them.
     """
-    n_u, n_v = (np.ceil(np.linalg.norm(part[name], axis=1) / largest_m - 1e-9).astype(np.int64) for name in "uv")
+    u, v = (np.linalg.norm(part[name], axis=1) for name in "uv")
+    n_u = np.ceil(u / np.minimum(largest_m, slimmest * v) - 1e-9).astype(np.int64)
+    n_v = np.ceil(v / np.minimum(largest_m, slimmest * u) - 1e-9).astype(np.int64)
     n_u, n_v = (np.where(part["shape"] == Shape.RECTANGLE, n, 1) for n in (n_u, n_v))
-    out = np.repeat(part, n_u * n_v)
-    copies = np.repeat(np.arange(len(part)), n_u * n_v)
-    tile = np.arange(len(out)) - np.repeat(np.cumsum(n_u * n_v) - n_u * n_v, n_u * n_v)
-    n_u, n_v = n_u[copies], n_v[copies]
+    n = n_u * n_v
+    which = np.repeat(np.arange(len(part)), n)
+    tile = np.arange(len(which)) - (np.cumsum(n) - n)[which]
+    out, n_u, n_v = part[which], n_u[which], n_v[which]
     out["u"] /= n_u[:, None]
     out["v"] /= n_v[:, None]
     out["origin"] += (tile % n_u)[:, None] * out["u"] + (tile // n_u)[:, None] * out["v"]
     return out
+
+
+def boxes(part: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(n, 3) lower and (n, 3) upper corners of boxes that hold each patch."""
+    ranges = np.array([(0, 1, 0, 0), (0, 1, 0, 0), (-1, 1, 0, 0), (-1, 1, 0, 1), (-1, 1, -1, 1), (-1, 1, -1, 1)])
+    low_uv, high_uv, low_w, high_w = (column[:, None] for column in ranges[part["shape"]].T)
+    lower, upper = part["origin"].copy(), part["origin"].copy()
+    for name, low, high in (("u", low_uv, high_uv), ("v", low_uv, high_uv), ("w", low_w, high_w)):
+        lower += np.minimum(low * part[name], high * part[name])
+        upper += np.maximum(low * part[name], high * part[name])
+    return lower, upper
 
 
 def areas(part: np.ndarray) -> np.ndarray:

@@ -39,10 +39,11 @@ class Surfaces:
         """Point number ``index[i]`` of primitive ``which[i]``: positions, unit normals and patch coordinates.
 
         which : (n,) int64.  index : (n,) int64, from 0 in each primitive.
-        Returns (3, n) float64 positions in metres, (3, n) float64 normals, (2, n) float64 in [0, 1) (where on the patch).
+        Returns (3, n) float64 positions in metres, (3, n) float64 normals, (2, n) float64 in [0, 1) (where on the
+        patch).
 
-        The points of a primitive are an additive recurrence: any prefix covers it evenly, and equal primitives get equal
-        points. Source: Roberts 2018, "The unreasonable effectiveness of quasirandom sequences" (R2).
+        The points of a primitive are an additive recurrence: any prefix covers it evenly, and equal primitives get
+        equal points. Source: Roberts 2018, "The unreasonable effectiveness of quasirandom sequences" (R2).
         """
         shape = self._shape[which]
         u_axis, v_axis, w_axis = (self._axes[name].take(which, axis=1) for name in "uvw")

@@ -15,9 +15,9 @@ from ..points import PointBatch, concatenate, pack_normals, pack_rgb
 from ..readers.source import Source, SourceInfo
 from .city import city, is_draped
 from .light import Light
-from .primitives import MATERIALS, Material, Shape
+from .primitives import MATERIALS, Material, boxes
 from .sampling import Surfaces, allot
-from .terrain import PITCH_M, STREET_M, height
+from .terrain import HIGHEST_M, LOWEST_M, PITCH_M, STREET_M, height
 
 CHUNK_POINTS = 1 << 15
 """Points made at a time. Random numbers are drawn per chunk, so the chunk and not the batch decides every point."""
@@ -27,7 +27,7 @@ _NOISE_LIMIT = 4.0  # standard deviations
 _LIGHT_POINTS_PER_M2 = 20
 DEFAULT_POINTS = 2_000_000
 DEFAULT_EXTENT_M = 225.0
-MOST_BLOCKS = 64
+MOST_BLOCKS = 12
 
 _CLASS = np.array([MATERIALS[m].classification for m in Material], np.uint8)
 _REFLECTANCE = np.array([MATERIALS[m].reflectance for m in Material], np.float32)
@@ -40,7 +40,7 @@ class CityScan(Source):
     extent_m : side of the city, rounded to whole blocks of 72 m plus one street. The default suits two million points.
     offset : (3,) metres, world position of the city's lower corner.
     Raises InputError for values out of range.
-    Cost: memory O(1) in n_points (one chunk and one batch); time linear.
+    Cost: time linear in n_points; memory of one batch, a few chunks and about 4 MB a block of the city.
     """
 
     ATTRIBUTES = ("rgb", "normal", "intensity", "classification", "return_number")
@@ -145,7 +145,7 @@ class CityScan(Source):
     def _surface(
         self, first: np.ndarray, start: int, stop: int
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Points start … stop − 1 without noise: their primitives, positions on the terrain, normals, patch coordinates."""
+        """Points start … stop − 1 without noise: primitive, position on the terrain, normal and patch coordinates."""
         low = int(np.searchsorted(first, start, side="right")) - 1
         high = int(np.searchsorted(first, stop, side="left"))
         inside = np.diff(np.clip(first[low : high + 1], start, stop))
@@ -159,32 +159,19 @@ class CityScan(Source):
         positions[2] = np.where(self._draped[which], z + ground, standing)
         return which, positions, normals, patch
 
-    def _survey(self, edge_m: float) -> np.ndarray:
+    def _survey(self, edge_m: float) -> Iterator[np.ndarray]:
         """A coarse sample of positions for the light, independent of n_points."""
         n = int(edge_m**2 * _LIGHT_POINTS_PER_M2)
         first = allot(self._primitives, n)
-        chunks = [self._surface(first, s, min(s + CHUNK_POINTS, n))[1] for s in range(0, n, CHUNK_POINTS)]
-        return np.concatenate(chunks, axis=1)
+        for start in range(0, n, CHUNK_POINTS):
+            yield self._surface(first, start, min(start + CHUNK_POINTS, n))[1]
 
     def _bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Corners of a box that holds every point: the primitives' boxes, the terrain's span and the noise."""
-        p = self._primitives
-        around = np.isin(p["shape"], [Shape.DISC, Shape.FRUSTUM, Shape.ELLIPSOID, Shape.FOLIAGE])
-        solid = p["shape"] >= Shape.ELLIPSOID
-        u, v = p["u"], p["v"]
-        w = np.where((p["shape"] >= Shape.FRUSTUM)[:, None], p["w"], 0.0)
-        widen = np.maximum(p["taper"], 1.0)[:, None]
-        less = np.where(around[:, None], -widen * (np.abs(u) + np.abs(v)), np.minimum(u, 0) + np.minimum(v, 0))
-        more = np.where(around[:, None], widen * (np.abs(u) + np.abs(v)), np.maximum(u, 0) + np.maximum(v, 0))
-        low = p["origin"] + less + np.where(solid[:, None], -np.abs(w), np.minimum(w, 0))
-        high = p["origin"] + more + np.where(solid[:, None], np.abs(w), np.maximum(w, 0))
-        rise = np.zeros((len(p), 1))
+        low, high = boxes(self._primitives)
         lower, upper = low.min(axis=0), high.max(axis=0)
-        span = np.linspace(lower[:2], upper[:2], 1024)
-        ground = height(span[:, :1], span[None, :, 1])
-        draped = is_draped(p)
-        lower[2] = min(low[~draped, 2].min(), low[draped, 2].min() + ground.min())
-        upper[2] = max(high[~draped, 2].max(), high[draped, 2].max() + ground.max())
+        lower[2] = min(lower[2], (low[self._draped, 2] + LOWEST_M).min())
+        upper[2] = max(upper[2], (high[self._draped, 2] + HIGHEST_M).max())
         margin = RANGE_NOISE_M * _NOISE_LIMIT + 1e-3
         return lower - margin + self._offset, upper + margin + self._offset
 

@@ -13,6 +13,7 @@ DISTRICT = 3
 """Blocks a side of the pattern that repeats; its middle block is the park."""
 
 _AMPLITUDE_M = 0.9
+LOWEST_M, HIGHEST_M = 0.0, 4 * _AMPLITUDE_M
 
 
 def height(x: Any, y: Any) -> Any:
