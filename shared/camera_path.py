@@ -25,7 +25,6 @@ NEAR_SHARE = 1e-4
 inside the scene sees what is close."""
 
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-_SURVEY_ATTRIBUTES = {"rgb", "intensity", "classification", "return_number", "gps_time"}
 
 
 class Path(Protocol):
@@ -112,12 +111,13 @@ def axis_vector(name: str) -> np.ndarray:
 def up_vector(scene: SceneInfo) -> np.ndarray:
     """(3,) float64 unit axis that points up in a scene.
 
-    Where the scene does not say, z; but y for a bare model (normals, and nothing that a survey has), as is the custom
-    in computer graphics.
+    Where the scene does not say, z; but y for the vertices of a bare mesh (PLY files with normals and without colour),
+    as is the custom in computer graphics.
     """
     if scene.up != "auto":
         return axis_vector(scene.up)
-    is_model = "normal" in scene.attributes and scene.crs is None and not _SURVEY_ATTRIBUTES & set(scene.attributes)
+    from_ply = all(source.name.lower().endswith(".ply") for source in scene.sources)
+    is_model = from_ply and "normal" in scene.attributes and "rgb" not in scene.attributes
     return axis_vector("y" if is_model else "z")
 
 

@@ -25,8 +25,9 @@ Z = np.array([0.0, 0.0, 1.0])
 AXES = ["x", "y", "z", "-x", "-y", "-z"]
 
 
-def scene(lower=(0.0, 0.0, 0.0), upper=(10.0, 6.0, 2.0), up="z", attributes=("rgb",), crs=None):
-    return SimpleNamespace(lower=lower, upper=upper, up=up, attributes=attributes, crs=crs)
+def scene(lower=(0.0, 0.0, 0.0), upper=(10.0, 6.0, 2.0), up="z", attributes=("rgb",), file="scan.laz"):
+    sources = (SimpleNamespace(name=file, n_points=1),)
+    return SimpleNamespace(lower=lower, upper=upper, up=up, attributes=attributes, sources=sources)
 
 
 def image_positions(camera, points):
@@ -141,10 +142,10 @@ def test_near_is_a_small_share_of_the_scene_unless_given():
     ("found", "expected"),
     [
         (scene(up="-y"), "-y"),
-        (scene(up="auto", attributes=("rgb", "normal")), "z"),
-        (scene(up="auto", attributes=("normal",)), "y"),
-        (scene(up="auto", attributes=("normal",), crs="EPSG:25832"), "z"),
-        (scene(up="auto", attributes=()), "z"),
+        (scene(up="auto", file="bunny.PLY", attributes=("normal", "intensity")), "y"),
+        (scene(up="auto", file="statue.ply", attributes=("rgb", "normal")), "z"),
+        (scene(up="auto", file="room.e57", attributes=("normal",)), "z"),
+        (scene(up="auto", file="points.ply", attributes=()), "z"),
     ],
 )
 def test_which_way_is_up(found, expected):
