@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     import moderngl
 
 _PIECE_POINTS = 4096
-"""Most points of a piece: of 256 … 16384 the smallest that costs nothing on llvmpipe (64 invocations a workgroup)."""
+"""Most points of a piece. Fewer cost time on llvmpipe, whose threads fetch workgroups one by one; more leave a GPU
+short of workgroups."""
 
 _BATCH_PIECES = 1 << 20
 """Most pieces of one dispatch or draw call: a 16 MiB buffer."""
@@ -98,9 +99,9 @@ class _GlRasterizer(ABC):
         height, width = self._shape
         if (camera.width, camera.height) != (width, height):
             raise MessageError(f"camera viewport: found {camera.width}×{camera.height}, expected {width}×{height}")
-        batches = self._batches(entries)
+        blocks, batches = self._batches(entries)
         with self._context:  # another rasterizer of this thread may have made its own current
-            self._rows.write(pixel_from_blocks(camera, self._block_origin))
+            self._rows.write(pixel_from_blocks(camera, self._block_origin[blocks]))
             image = self._draw(camera, batches)
             check_errors(self._context, "drawing")
         return image
@@ -138,20 +139,27 @@ class _GlRasterizer(ABC):
         check_errors(self._context, f"allocating {buffer.size} bytes for {what}")
         return buffer
 
-    def _batches(self, entries: np.ndarray) -> list[tuple[int, np.ndarray]]:
-        """(chunk, (p, 4) uint32 pieces: first point in the chunk, count, stride, block) of a frame's entries."""
+    def _batches(self, entries: np.ndarray) -> tuple[np.ndarray, list[tuple[int, np.ndarray]]]:
+        """What a frame draws: blocks, and batches of pieces.
+
+        Returns: (k,) int64 indices of the blocks whose matrices the frame needs; batches of (chunk, (p, 4) uint32
+            pieces: first point in the chunk, count, stride, place of the block among the k).
+        """
         pieces = split_entries(entries, self._segment_first, self._n_points, _PIECE_POINTS)
-        chunk = self._segment_chunk[pieces["segment"]]
+        chunk, block = self._segment_chunk[pieces["segment"]], self._segment_block[pieces["segment"]]
+        drawn = np.zeros(len(self._block_origin), bool)
+        drawn[block] = True
+        place = np.cumsum(drawn) - 1
         table = np.empty((len(pieces), 4), np.uint32)
         table[:, 0] = pieces["first"] - self._chunk_first[chunk]
         table[:, 1] = pieces["count"]
         table[:, 2] = pieces["stride"]
-        table[:, 3] = self._segment_block[pieces["segment"]]
+        table[:, 3] = place[block]
         batches = []
         for i in range(len(self._chunks)):
             mine = table[chunk == i]
             batches += [(i, mine[k : k + _BATCH_PIECES]) for k in range(0, len(mine), _BATCH_PIECES)]
-        return batches
+        return np.flatnonzero(drawn), batches
 
     def _bind(self, chunk: int, pieces: np.ndarray) -> None:
         for binding, buffer in enumerate(self._chunks[chunk]):
