@@ -1,0 +1,143 @@
+"""The compressed point records of LAZ and COPC files: lazrs behind checks of every length it would believe.
+
+lazrs allocates what a file's tables promise, and an allocation that fails ends the process; so the chunk table, and for
+layered compression (point formats 6 and up) the layer sizes of each chunk, are held against the file's size first.
+Layout: Isenburg, "LASzip: lossless compression of LiDAR data" (2013) and the LAZ specification 1.4, section 4.
+"""
+
+from __future__ import annotations
+
+import importlib
+import struct
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from ..errors import InputError
+
+_POINTWISE, _CHUNKED, _LAYERED = 1, 2, 3
+_LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}  # item type → layers: point14, rgb14, rgb-nir14, wave packet14
+_BYTES14 = 14  # one layer a byte
+_ENDLESS_CHUNK = 0xFFFF_FFFE
+_MAX_CHUNK_POINTS = 1 << 24  # the parallel decompressor holds whole chunks; writers use 50 000
+
+
+class LazRecords:
+    """The point records of a compressed file.
+
+    file : open file; it must live as long as this object.  header : laspy.LasHeader.  dtype : of a record.
+    attributes : columns to decompress besides the positions; the others are left as they come (point formats 6 and up).
+    parallel : decompress the chunks of one call on all cores; such an object only reads on (seeking into the last
+        of several variable-size chunks fails in lazrs 0.8).
+    Raises InputError if the compression record or the chunk table contradicts the header or the file's size.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        file: BinaryIO,
+        header: Any,
+        dtype: np.dtype,
+        *,
+        attributes: Collection[str],
+        parallel: bool,
+    ):
+        record = _compression_record(path, header, dtype)
+        self.can_seek = _compressor(record) != _POINTWISE
+        if self.can_seek:
+            largest = _check_chunks(path, file, header, record)
+            parallel = parallel and largest <= _MAX_CHUNK_POINTS
+        else:  # one stream without chunks, which lazrs reads as one chunk that never ends
+            record = record[:12] + struct.pack("<I", _ENDLESS_CHUNK) + record[16:]
+            parallel = False
+        file.seek(header.offset_to_point_data)
+        lazrs = _lazrs()
+        decompressor = lazrs.ParLasZipDecompressor if parallel else lazrs.LasZipDecompressor
+        layers = lazrs.SELECTIVE_DECOMPRESS_XY_RETURNS_CHANNEL | lazrs.SELECTIVE_DECOMPRESS_Z
+        for attribute in attributes:
+            layers |= getattr(lazrs, f"SELECTIVE_DECOMPRESS_{attribute.upper()}", 0)
+        self._decompressor = decompressor(file, record, lazrs.DecompressionSelection(layers))
+
+    def seek(self, point: int) -> None:
+        """The next record to be read; where ``can_seek``."""
+        self._decompressor.seek(point)
+
+    def read_into(self, out: np.ndarray) -> None:
+        """Fill (n,) records. Raises lazrs.LazrsError where the compressed data ends early or makes no sense."""
+        self._decompressor.decompress_many(out.view(np.uint8))
+
+
+def _lazrs() -> Any:
+    """The module, imported when used; it is compiled and has no types."""
+    return importlib.import_module("lazrs")
+
+
+def _compression_record(path: Path, header: Any, dtype: np.dtype) -> bytes:
+    records = header.vlrs.get("LasZipVlr")
+    if not records:
+        raise InputError(f"{path}: damaged: found no LASzip record, expected one in a compressed file")
+    record = bytes(records[0].record_data)
+    if len(record) < 34 or _compressor(record) not in (_POINTWISE, _CHUNKED, _LAYERED):
+        raise InputError(f"{path}: damaged: the LASzip record is cut or names an unknown compressor")
+    item_bytes = _lazrs().LazVlr(record).item_size()
+    if item_bytes != dtype.itemsize:
+        raise InputError(f"{path}: damaged: found compressed records of {item_bytes} bytes, expected {dtype.itemsize}")
+    return record
+
+
+def _check_chunks(path: Path, file: BinaryIO, header: Any, record: bytes) -> int:
+    """Points of the largest chunk. Raises InputError where a length does not fit."""
+    start = header.offset_to_point_data
+    size = file.seek(0, 2)
+    damaged = InputError(f"{path}: truncated or damaged: the chunk table does not fit the file's {size} bytes")
+    table = _table_offset(file, start, size)
+    if not start + 8 <= table <= size - 8:
+        raise damaged
+    file.seek(table)
+    _, n_chunks = struct.unpack("<II", file.read(8))
+    item_bytes = _lazrs().LazVlr(record).item_size()
+    if n_chunks * item_bytes > size - start:  # a chunk starts with one raw record
+        raise damaged
+    file.seek(start)
+    chunks = _lazrs().read_chunk_table(file, _lazrs().LazVlr(record))
+    if sum(n_bytes for _, n_bytes in chunks) > size - start:
+        raise damaged
+    n_points = sum(n for n, _ in chunks)
+    if n_points < header.point_count:
+        raise InputError(
+            f"{path}: truncated or damaged: found chunks for {n_points} points, expected the {header.point_count} of "
+            "its header"
+        )
+    if _compressor(record) == _LAYERED:
+        at = start + 8
+        for _, n_bytes in chunks:
+            file.seek(at + item_bytes)
+            sizes = np.frombuffer(file.read(4 * (1 + _layer_count(record))), "<u4")[1:]
+            if int(sizes.sum(dtype=np.uint64)) > n_bytes:
+                raise damaged
+            at += n_bytes
+    return max((n for n, _ in chunks), default=0)
+
+
+def _table_offset(file: BinaryIO, start: int, size: int) -> int:
+    """Where the chunk table is; a writer that could not seek back left the place in the last eight bytes."""
+    if size < start + 8:
+        return -1
+    file.seek(start)
+    (offset,) = struct.unpack("<q", file.read(8))
+    if offset == -1:
+        file.seek(size - 8)
+        (offset,) = struct.unpack("<q", file.read(8))
+    return offset
+
+
+def _compressor(record: bytes) -> int:
+    return struct.unpack_from("<H", record)[0]
+
+
+def _layer_count(record: bytes) -> int:
+    (n_items,) = struct.unpack_from("<H", record, 32)
+    items = [struct.unpack_from("<HHH", record, 34 + 6 * i) for i in range(n_items)]
+    return sum(size if kind == _BYTES14 else _LAYERS.get(kind, 0) for kind, size, _ in items)
