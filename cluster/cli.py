@@ -167,6 +167,23 @@ def bench_build(
     _report(measure(n_points=points, repeats=repeats, workdir=workdir), print_build, json)
 
 
+@bench_app.command("pipeline")
+def bench_pipeline(
+    config: Annotated[Path, typer.Argument(help="Configuration of a run.")],
+    sets: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a key.")] = None,
+    repeats: Annotated[int, typer.Option(help="Runs of each topology.", min=1)] = 3,
+    json: JsonOption = None,
+) -> None:
+    """Three ranks against the slowest of the three stages alone.
+
+    Example: `splatpipe bench pipeline configs/demo.toml --set render.threads=1`
+    """
+    from .bench.pipeline import bench_pipeline as measure
+    from .bench.pipeline import print_pipeline
+
+    _report(measure(config, sets or [], repeats), print_pipeline, json)
+
+
 def _report(results: dict[str, Any], show: Any, json: Path | None) -> None:
     from rich.console import Console
 

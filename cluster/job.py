@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -31,11 +32,11 @@ class Job:
         if not config.scene.path:
             raise ConfigError("scene.path: missing, expected a scene directory made by splatpipe build")
         self.config = config
-        self.scene = Scene.open(Path(config.scene.path))
+        self.scene = Scene.open(Path(os.path.normpath(config.scene.path)))
         info = self.scene.info
         self.n_frames = config.output.frames
         self.frames_in_flight = config.pipeline.frames_in_flight
-        self.output = Path(config.output.directory)
+        self.output = Path(os.path.normpath(config.output.directory))
         self.backface = config.culling.backface and "normal" in info.attributes
         self.pixel_threshold = config.sampling.pixel_threshold
         render = config.render

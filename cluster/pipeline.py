@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from ..shared.messages import RENDER_POINT, Kind, decode
+from ..shared.messages import RENDER_POINT, Kind, decode_camera, decode_render_points, decode_visibility
 from .job import Job
 from .record import StageClock, rank_record, spread_ms
 from .transport import Transport
@@ -129,8 +129,8 @@ def _sample(job: Job, transport: Transport) -> None:
     bits_bytes = (len(octree) + 7) // 8
     for _ in range(job.n_frames):
         with clock.waiting():
-            camera = decode(*transport.receive(CULLING, Kind.CAMERA, _MAX_CAMERA_BYTES))
-            bits = decode(*transport.receive(CULLING, Kind.VISIBILITY, bits_bytes), n_cells=len(octree))
+            camera = decode_camera(*transport.receive(CULLING, Kind.CAMERA, _MAX_CAMERA_BYTES))
+            bits = decode_visibility(*transport.receive(CULLING, Kind.VISIBILITY, bits_bytes), len(octree))
         with clock.working():
             chosen = sampling.process(camera, bits)
         transport.send(RENDER, chosen)
@@ -145,8 +145,8 @@ def _render(job: Job, transport: Transport) -> None:
         transport.meet()
         for frame in range(job.n_frames):
             with clock.waiting():
-                camera = decode(*transport.receive(CULLING, Kind.CAMERA, _MAX_CAMERA_BYTES))
-                chosen = decode(*transport.receive(SAMPLING, Kind.RENDER_POINTS, chosen_bytes))
+                camera = decode_camera(*transport.receive(CULLING, Kind.CAMERA, _MAX_CAMERA_BYTES))
+                chosen = decode_render_points(*transport.receive(SAMPLING, Kind.RENDER_POINTS, chosen_bytes))
             with clock.working():
                 picture = render.draw(camera, chosen)
             with clock.waiting():

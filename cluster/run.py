@@ -146,6 +146,7 @@ def _finish(
         "config_sha256": hashlib.sha256(job.config.model_dump_json().encode()).hexdigest(),
         "config": job.config.model_dump(mode="json"),
         "scene": {"points": job.scene.info.n_points, "cells": job.scene.info.n_cells},
+        "colour": job.colouring.mode,
         "frames": n_frames,
         "frames_per_s": n_frames / result["rendered_s"],
         "seconds": result["finished_s"],

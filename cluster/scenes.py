@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +46,7 @@ def _build(sources: list[Any], output: Path, settings: BuildSettings, json: Path
     seconds = time.perf_counter() - started
     _tell_build(output, report, seconds)
     if json is not None:
-        write_json(json, {"seconds": seconds, "points": report.n_points, **report.as_dict()})
+        write_json(json, {"seconds": seconds, **asdict(report), "path": str(report.path)})
 
 
 def _tell_build(output: Path, report: BuildReport, seconds: float) -> None:
@@ -79,7 +80,10 @@ def verify_command(path: Path) -> None:
 
 
 def _scene_info(path: Path) -> dict[str, Any]:
-    return {"scene": str(path)} | Scene.open(path).info.as_dict()
+    info = asdict(Scene.open(path).info)
+    size = sum(array["bytes"] for array in info.pop("arrays").values())
+    info["sources"] = [f"{source['name']} ({source['n_points']:,})" for source in info["sources"]]
+    return {"scene": str(path), **info, "bytes": size}
 
 
 def _file_info(path: Path) -> dict[str, Any]:

@@ -24,9 +24,8 @@ _SLEEP_S = 100e-6
 
 
 class Received(NamedTuple):
-    """A message as it arrived: kind, frame number and payload bytes."""
+    """A message as it arrived: frame number and payload bytes."""
 
-    kind: Kind
     frame: int
     payload: memoryview
 
@@ -80,7 +79,7 @@ class Transport:
         payload = np.empty(length, np.uint8)
         requests = [self._comm.Irecv([piece, self._mpi.BYTE], source, int(expected)) for piece in self._pieces(payload)]
         self._wait(requests, source, expected.name)
-        return Received(kind, frame, payload.data)
+        return Received(frame, payload.data)
 
     def receive_note(self, source: int, expected: Kind) -> tuple[int, dict[str, Any]]:
         """(frame, note) of the next note of a kind. Raises MessageError if it is not a JSON object."""

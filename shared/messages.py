@@ -33,8 +33,8 @@ RENDER_POINT = np.dtype([("offset", "<u8"), ("range", "<u4"), ("stride", "<u4")]
 offset + range of the point-array."""
 
 FRAMEBUFFER_EMPTY = np.uint64(0xFFFF_FFFF_FFFF_FFFF)
-"""Framebuffer word of a pixel no point fell on. Otherwise ``depth bits << 32 | colour word``: depth is the float32
-distance along the view axis (positive, so its bits order as integers), and the nearest point wins by integer minimum."""
+"""Framebuffer word of a pixel no point fell on. Otherwise ``depth bits << 32 | colour word``: depth is float32, the
+distance along the view axis (positive, so its bits order as integers); the nearest point wins by integer minimum."""
 
 
 class Kind(IntEnum):
@@ -127,27 +127,27 @@ def encode(message: Message) -> tuple[bytes, memoryview]:
             return header(Kind.RENDER_POINTS, message.frame, len(payload)), payload
 
 
-def decode(kind: Kind, frame: int, payload: bytes | bytearray | memoryview, *, n_cells: int = 0) -> Message:
-    """The message of a payload whose header said ``kind`` and ``frame``; arrays are views of ``payload``.
+Bytes = bytes | bytearray | memoryview
 
-    n_cells : cells of the scene, needed for visibility bits.
-    Raises MessageError if the payload's length is not what its kind needs.
-    """
-    size = len(payload)
-    match kind:
-        case Kind.CAMERA:
-            _expect(kind, size, _CAMERA.size)
-            v = _CAMERA.unpack(payload)
-            return Camera(frame, np.array(v[:16]).reshape(4, 4), np.array(v[16:19]), v[19], v[20], v[21])
-        case Kind.VISIBILITY:
-            _expect(kind, size, (n_cells + 7) // 8)
-            return VisibilityBits(frame, n_cells, np.frombuffer(payload, np.uint8))
-        case Kind.RENDER_POINTS:
-            if size % RENDER_POINT.itemsize:
-                raise MessageError(f"render-points: found {size} bytes, expected a multiple of 16")
-            return RenderPoints(frame, np.frombuffer(payload, RENDER_POINT))
-        case _:
-            raise MessageError(f"message kind {kind.name} carries no pipeline data")
+
+def decode_camera(frame: int, payload: Bytes) -> Camera:
+    """The camera of a payload. Raises MessageError for a wrong length."""
+    _expect(Kind.CAMERA, len(payload), _CAMERA.size)
+    v = _CAMERA.unpack(payload)
+    return Camera(frame, np.array(v[:16]).reshape(4, 4), np.array(v[16:19]), v[19], v[20], v[21])
+
+
+def decode_visibility(frame: int, payload: Bytes, n_cells: int) -> VisibilityBits:
+    """The visibility bits of a payload, a view of it. Raises MessageError unless it has a bit for each cell."""
+    _expect(Kind.VISIBILITY, len(payload), (n_cells + 7) // 8)
+    return VisibilityBits(frame, n_cells, np.frombuffer(payload, np.uint8))
+
+
+def decode_render_points(frame: int, payload: Bytes) -> RenderPoints:
+    """The render-points of a payload, a view of it. Raises MessageError for a length that is no whole entries."""
+    if len(payload) % RENDER_POINT.itemsize:
+        raise MessageError(f"render-points: found {len(payload)} bytes, expected a multiple of {RENDER_POINT.itemsize}")
+    return RenderPoints(frame, np.frombuffer(payload, RENDER_POINT))
 
 
 def _expect(kind: Kind, found: int, expected: int) -> None:
