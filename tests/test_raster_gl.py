@@ -116,6 +116,13 @@ class TestOnDevice:
                 with rasterizer(points, WIDTH, HEIGHT) as split:
                     np.testing.assert_array_equal(split.draw(camera(), SOME), expected)
 
+    def test_two_passes_equal_one_pass_of_64_bit_atomics(self, points, monkeypatch):
+        with GlComputeRasterizer(points, WIDTH, HEIGHT) as whatever_the_driver_has:
+            expected = whatever_the_driver_has.draw(camera(), ALL).copy()
+        monkeypatch.setattr(gl, "_ATOMIC_INT64", ("GL_ABSENT",))
+        with GlComputeRasterizer(points, WIDTH, HEIGHT) as two_passes:
+            np.testing.assert_array_equal(two_passes.draw(camera(), ALL), expected)
+
     @BOTH
     def test_more_pieces_than_one_dispatch_dimension_holds(self, points, rasterizer):
         single = np.zeros(70_000, RENDER_POINT)

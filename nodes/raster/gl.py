@@ -27,6 +27,8 @@ short of workgroups."""
 _BATCH_PIECES = 1 << 20
 """Most pieces of one dispatch or draw call: a 16 MiB buffer."""
 
+_ATOMIC_INT64 = ("GL_ARB_gpu_shader_int64", "GL_NV_shader_atomic_int64")
+
 _ROWS, _PIECES, _FRAMEBUFFER = 4, 5, 6  # bindings behind x, y, z and colour, as in the shaders
 
 
@@ -37,7 +39,7 @@ class _GlRasterizer(ABC):
     width, height : size of every frame, pixels.
     device_index : in EGL's order; GLCONTEXT_DEVICE_INDEX wins.
     Raises InputError: the viewport is empty or above the device's texture size.
-    Raises DeviceError: no OpenGL 4.3, not enough device memory, a frame or matrices above the storage-block limit.
+    Raises DeviceError: no OpenGL 4.5, not enough device memory, a frame or matrices above the storage-block limit.
     Device memory: 16 bytes a point. To be used from the thread that made it.
     """
 
@@ -189,8 +191,8 @@ class GlComputeRasterizer(_GlRasterizer):
     def _prepare(self) -> None:
         context = self._context
         extensions, passes = (), ("PASS_DEPTH", "PASS_COLOUR")
-        if context.extensions >= {"GL_NV_shader_atomic_int64", "GL_ARB_gpu_shader_int64"}:
-            extensions, passes = ("GL_ARB_gpu_shader_int64", "GL_NV_shader_atomic_int64"), ("PASS_WORD",)
+        if context.extensions.issuperset(_ATOMIC_INT64):
+            extensions, passes = _ATOMIC_INT64, ("PASS_WORD",)
         self._programs = [
             context.compute_shader(
                 shader_source("points", "scatter.comp", extensions=extensions, defines=(*self._defines, one))

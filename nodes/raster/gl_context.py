@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import moderngl
 
 _LIBRARY = "libEGL.so.1"
-_VERSION = 430  # compute shaders and storage buffers
+_VERSION = 450  # compute shaders came with 4.3; drivers take 64-bit atomics from GLSL 4.50 on
 _PROBE_S = 60
 
 
@@ -53,7 +53,7 @@ def open_context(device_index: int) -> moderngl.Context:
     """A context on an EGL device, current in this thread; the caller releases it.
 
     device_index : in the order of EGL, which is not that of CUDA; GLCONTEXT_DEVICE_INDEX in the environment wins.
-    Raises DeviceError: moderngl or a library is missing, no such device, or OpenGL is older than 4.3.
+    Raises DeviceError: moderngl or a library is missing, no such device, or OpenGL is older than 4.5.
     """
     _check_installed()
     import moderngl
@@ -65,7 +65,7 @@ def open_context(device_index: int) -> moderngl.Context:
         return moderngl.create_context(require=_VERSION, standalone=True, **settings)
     except Exception as error:  # the binding raises bare Exception
         index = os.environ.get("GLCONTEXT_DEVICE_INDEX", device_index)
-        raise DeviceError(f"OpenGL: no OpenGL 4.3 on EGL device {index}: {error}") from error
+        raise DeviceError(f"OpenGL: no OpenGL 4.5 on EGL device {index}: {error}") from error
 
 
 def storage_limit(context: moderngl.Context) -> int:

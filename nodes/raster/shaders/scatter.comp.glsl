@@ -11,8 +11,8 @@ uniform uint n_pieces;
 #ifdef PASS_WORD
 layout(std430, binding = 6) restrict buffer Framebuffer { uint64_t words[]; };
 void cover(int pixel, uint depth, uint point) {
-    if (depth <= unpackUint2x32(words[pixel]).y)
-        atomicMin(words[pixel], packUint2x32(uvec2(colour[point], depth)));
+    if (depth <= uint(words[pixel] >> 32))
+        atomicMin(words[pixel], uint64_t(depth) << 32 | uint64_t(colour[point]));
 }
 #else
 layout(std430, binding = 6) restrict buffer Framebuffer { uvec2 words[]; };  // colour, depth bits
