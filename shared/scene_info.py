@@ -17,6 +17,7 @@ from .points import ATTRIBUTES
 FORMAT_VERSION = 1
 SCENE_FILE = "scene.json"
 POINT_ORDERS = ("layered", "depth-first")
+UP_AXES = ("x", "y", "z", "-x", "-y", "-z", "auto")
 CELL_ARRAYS = {
     "cell_level": np.dtype("u1"),
     "cell_code": np.dtype("<u8"),
@@ -57,7 +58,7 @@ class SceneInfo:
     n_points : input points.  n_stored : points in the point-array, level-of-detail copies included.
     n_dropped : input points left out because a coordinate was not finite.
     block_levels : a block of cells is the subtree of the ancestor this many levels above a cell.
-    up : ``x``, ``y``, ``z`` or ``auto``.  crs : well-known text, or None.
+    up : the axis that points up, one of ``UP_AXES``.  crs : well-known text, or None.
     build : the settings the scene was built with.
     """
 
@@ -103,7 +104,7 @@ def parse_info(path: Path) -> SceneInfo:
     if not isinstance(content, dict):
         raise StoreError(f"{path}: found {type(content).__name__}, expected an object")
     version = content.get("format_version")
-    if not _is_count(version) or version < 1:
+    if not isinstance(version, int) or isinstance(version, bool) or version < 1:
         raise StoreError(f"{path}: format_version = {version!r}, expected a whole number ≥ 1")
     if version > FORMAT_VERSION:
         raise StoreError(
@@ -205,7 +206,7 @@ _RULES = {
         f"different names of {', '.join(ATTRIBUTES)}",
     ),
     "block_levels": _COUNT,
-    "up": (lambda v: v in ("x", "y", "z", "auto"), "x, y, z or auto"),
+    "up": (lambda v: v in UP_AXES, f"one of {', '.join(UP_AXES)}"),
     "crs": (lambda v: v is None or isinstance(v, str), "a text or null"),
     "sources": (lambda v: isinstance(v, list) and all(_is_source(s) for s in v), "a list of name and n_points"),
     "build": (lambda v: isinstance(v, dict), "an object"),

@@ -22,6 +22,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .errors import StoreError
 from .octree import MAX_LEVEL, Octree
@@ -124,7 +125,7 @@ class Scene:
         owners = owners[np.argsort(octree.first_point[owners], kind="stable")]
         owner_first = octree.first_point[owners]
         columns = self.positions()
-        slack = float(np.max(np.spacing(np.abs([self.info.lower, self.info.upper])))) * 2
+        slack = float(np.max(np.spacing(np.abs([self.info.lower, self.info.upper])))) * 8
         for start in range(0, self.info.n_stored, _CHUNK // 8):
             stop = min(start + _CHUNK // 8, self.info.n_stored)
             index = np.arange(start, stop)
@@ -138,7 +139,7 @@ class Scene:
                 if not (np.abs(from_center) <= allowed).all():
                     bad = int(index[~(np.abs(from_center) <= allowed)][0])
                     raise StoreError(
-                        f"{self.path}/{'xyz'[axis]}.npy: point {bad} lies outside the cube of its cell {cell[bad - start]}"
+                        f"{self.path}/{'xyz'[axis]}.npy: point {bad} lies outside the cube of cell {cell[bad - start]}"
                     )
             if progress:
                 progress("points", stop, self.info.n_stored)
@@ -151,14 +152,14 @@ class Scene:
 
     def _load_checked(self, name: str) -> np.ndarray:
         array = self._load(name, mmap=False)
-        _expect_crc(self.path / f"{name}.npy", zlib.crc32(np.ascontiguousarray(array)), self.info.arrays[name])
+        _expect_crc(self.path / f"{name}.npy", zlib.crc32(np.ascontiguousarray(array).data), self.info.arrays[name])
         return array
 
 
 def check_octree(octree: Octree, info: SceneInfo, path: Path) -> None:
     """Raise StoreError unless links, codes, counts and ranges of the cells hold together; vectorised, O(cells)."""
 
-    def require(holds: np.ndarray | bool, array: str, rule: str) -> None:
+    def require(holds: ArrayLike, array: str, rule: str) -> None:
         if not np.all(holds):
             bad = int(np.flatnonzero(~np.asarray(holds))[0]) if np.ndim(holds) else 0
             raise StoreError(f"{path}/cell_{array}.npy: entry {bad}: {rule}")

@@ -11,6 +11,9 @@ module             owns
 ``sets``           order inside a leaf, level-of-detail sets of inner cells
 ``cones``          normal cones
 ``subtree``        one partition: the above put together
+``runs``           sorted runs on disk, for inputs larger than memory, and partitions that fit
+``streamed``       a leaf larger than memory
+``parallel``       threads over kernels
 ``assembly``       subtrees → one sequential octree
 ``point_array``    stored points: gathered, made relative to their block, appended
 ``writer``         the scene directory: partial, checksums, rename

@@ -34,6 +34,11 @@ class Assembly:
         """Subtrees taken so far."""
         return len(self._parts)
 
+    @property
+    def n_points(self) -> int:
+        """Input points in the subtrees taken so far."""
+        return sum(int(p.count[0]) for p in self._parts)
+
     def add(self, cells: LinkedCells, root_set: PointBatch) -> None:
         """One subtree, its point ranges counted from the scene's first point, and at least the first ``capacity``
         points of its root's own set.

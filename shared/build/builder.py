@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -13,23 +14,18 @@ from ..points import PointBatch
 from ..readers.source import Source
 from ..scene_info import SceneInfo, SourceCount
 from .assembly import Assembly
-from .ingest import Columns, Tally, common_attributes, finite_batches
-from .morton import morton_keys, root_cube
+from .ingest import Bounds, Columns, Tally, common_attributes, declared_bounds, finite_batches, root_bounds
+from .morton import keys_of, root_cube
 from .parallel import Workers
 from .partition import Subdivision
 from .point_array import PointArrayWriter, block_levels_of
-from .settings import BuildReport, BuildSettings
+from .runs import Partition, Runs
+from .settings import BuildReport, BuildSettings, MemoryPlan, plan_memory
+from .streamed import append_streamed_leaf
 from .subtree import build_subtree
 from .writer import SceneWriter, settings_json
 
 Progress = Callable[[str, int, int | None], None]
-
-
-def keys_of(positions: np.ndarray, origin: np.ndarray, edge: float, workers: Workers) -> np.ndarray:
-    """(n,) int64 Morton keys of (n, 3) finite positions."""
-    keys = np.empty(len(positions), np.int64)
-    workers.map(morton_keys, [(positions, origin, 2.0**21 / edge, a, b, keys) for a, b in workers.ranges(len(keys))])
-    return keys
 
 
 def build_scene(
@@ -39,91 +35,185 @@ def build_scene(
     settings: BuildSettings | None = None,
     progress: Progress | None = None,
 ) -> BuildReport:
-    settings = settings or BuildSettings()
-    report_progress = progress or (lambda stage, done, total: None)
-    inputs = list(sources)
-    if not inputs:
-        raise InputError("build: found no inputs, expected at least one")
-    kept, dropped = common_attributes(inputs, settings.attributes)
-    rule = Subdivision(settings.points_per_cell, settings.max_depth, settings.flatness)
-    stage_s = {}
-    clock = time.perf_counter()
-    promised = [s.info.n_points for s in inputs]
-    expected = None if None in promised else sum(p for p in promised if p is not None)
-    with SceneWriter(Path(out), overwrite=settings.overwrite) as writer, Workers(settings.threads) as workers:
-        tally = Tally()
-        columns = Columns(expected or 1 << 26, kept)
-        for batch in finite_batches(inputs, kept, 1 << 20, settings.strict, tally):
-            columns.add(batch)
-            report_progress("read", tally.n_points, expected)
-        if not tally.n_points:
-            raise InputError(f"{inputs[0].info.path}: found no finite point, expected at least one")
-        stage_s["read"] = time.perf_counter() - clock
-        points = columns.points()
-        origin, edge = root_cube(tally.lower, tally.upper)
-        levels = block_levels_of(settings.points_per_cell)
-        array = PointArrayWriter(writer, kept, origin, edge, levels)
-        assembly = Assembly(settings.point_order, settings.points_per_cell)
+    """Build the scene directory ``out`` from all points of the sources.
 
-        clock = time.perf_counter()
-        keys = keys_of(points.positions, origin, edge, workers)
-        subtree = build_subtree(keys, points.attributes.get("normal"), 0, 0, rule, settings.point_order, workers)
-        stage_s["sort"] = time.perf_counter() - clock
-        clock = time.perf_counter()
-        add_partition(subtree, points, array, assembly, settings, workers)
-        assembly.append_top(array, workers)
-        stage_s["write"] = time.perf_counter() - clock
-        clock = time.perf_counter()
-        cells = assembly.cell_arrays("normal" in kept)
-        for name, values in cells.items():
-            writer.write_array(name, values)
-        first, block_origin = array.blocks()
-        writer.write_array("block_first_point", first)
-        writer.write_array("block_origin", block_origin)
-        arrays = writer.close_columns()
+    progress : called with (``read`` or ``write``, points done, points in all or None), from more than one thread.
+    Points that do not fit into ``settings.memory_bytes`` are sorted into runs inside ``OUT.partial`` and built
+    partition by partition; cells, sets and their order are the same for any memory and any number of threads, the
+    place of a cell's range in the point-array is not. A build that was killed is started again from clean.
+    Raises InputError for inputs that cannot be used, a target that must not be replaced, or a full disk; nothing is
+    left behind then.
+    Cost: O(n); each input is read once, twice if it does not fit into memory and states no bounds or wrong ones.
+    """
+    return _Build(list(sources), Path(out), settings or BuildSettings(), progress or _silent).run()
+
+
+def _silent(stage: str, done: int, total: int | None) -> None:
+    pass
+
+
+class _Build:
+    """One build: reading, partitions, the cells above them, ``scene.json``."""
+
+    def __init__(self, sources: list[Source], out: Path, settings: BuildSettings, progress: Progress) -> None:
+        if not sources:
+            raise InputError("build: found no inputs, expected at least one")
+        self.sources, self.out, self.settings, self.progress = sources, out, settings, progress
+        self.attributes, self.dropped_attributes = common_attributes(sources, settings.attributes)
+        self.memory: MemoryPlan = plan_memory(settings, self.attributes)
+        self.rule = Subdivision(settings.points_per_cell, settings.max_depth, settings.flatness)
+        self.declared = declared_bounds(sources)
+        self.stage_s: dict[str, float] = {}
+
+    def run(self) -> BuildReport:
+        with (
+            SceneWriter(self.out, overwrite=self.settings.overwrite) as self.writer,
+            Workers(self.settings.threads) as self.workers,
+        ):
+            with self.timed("read"):
+                held, runs, tally = self.read_all()
+                origin, edge = root_cube(*root_bounds(self.declared, tally))
+            self.array = PointArrayWriter(
+                self.writer, self.attributes, origin, edge, block_levels_of(self.settings.points_per_cell)
+            )
+            self.assembly = Assembly(self.settings.point_order, self.settings.points_per_cell)
+            if runs is None:
+                self.add_partition(held, keys_of(held.positions, origin, edge, self.workers), 0, 0, tally.n_points)
+            else:
+                for partition in runs.partitions(self.memory.capacity):
+                    self.add_from_runs(runs, partition, tally.n_points)
+            with self.timed("write"):
+                self.assembly.append_top(self.array, self.workers)
+            with self.timed("finish"):
+                info = self.finish(origin, edge, tally)
+        return BuildReport(
+            path=self.out,
+            n_points=info.n_points,
+            n_stored=info.n_stored,
+            n_cells=info.n_cells,
+            n_dropped=info.n_dropped,
+            dropped_attributes=self.dropped_attributes,
+            n_partitions=self.assembly.n_partitions,
+            spilled_bytes=runs.bytes if runs else 0,
+            bytes=sum(array.bytes for array in info.arrays.values()),
+            stage_s=self.stage_s,
+        )
+
+    @contextmanager
+    def timed(self, stage: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        self.stage_s[stage] = self.stage_s.get(stage, 0.0) + time.perf_counter() - start
+
+    def read_all(self) -> tuple[PointBatch, Runs | None, Tally]:
+        """The points in memory, or else none of them and the runs that hold them."""
+        held, runs, tally = self.read_with(self.declared)
+        bounds = root_bounds(self.declared, tally)
+        if runs is not None and bounds is not self.declared and not runs.built_for(*root_cube(*bounds)):
+            runs.discard()  # the headers were wrong: once more, now that the bounds are known
+            held, runs, tally = self.read_with(bounds)
+        return held, runs, tally
+
+    def read_with(self, bounds: Bounds | None) -> tuple[PointBatch, Runs | None, Tally]:
+        promised = [source.info.n_points for source in self.sources]
+        expected = None if None in promised else sum(n for n in promised if n is not None)
+        capacity = self.memory.capacity
+        columns = Columns(capacity if expected is None else max(1, min(capacity, expected)), self.attributes)
+        runs: Runs | None = None
+        tally = Tally()
+        for batch in finite_batches(self.sources, self.attributes, self.memory.batch, self.settings.strict, tally):
+            while len(batch) > columns.room:
+                room = columns.room
+                columns.add(batch.select(slice(0, room)))
+                batch = batch.select(slice(room, None))
+                if runs is None:
+                    runs = self.new_runs(bounds or self.measured_bounds())
+                runs.add(columns.points())
+                columns.clear()
+            columns.add(batch)
+            self.progress("read", tally.n_points, expected)
+        if not tally.n_points:
+            raise InputError(f"{self.sources[0].info.path}: found no finite point, expected at least one")
+        if runs is not None and columns.n_points:
+            runs.add(columns.points())
+            columns.clear()
+        return columns.points(), runs, tally
+
+    def new_runs(self, bounds: Bounds) -> Runs:
+        directory = self.writer.partial / "runs"
+        return Runs(directory, self.attributes, *root_cube(*bounds), self.rule, self.workers)
+
+    def measured_bounds(self) -> Bounds:
+        """Tight bounds by a pass over the positions alone."""
+        tally = Tally()
+        for _ in finite_batches(self.sources, (), self.memory.batch, self.settings.strict, tally):
+            self.progress("bounds", tally.n_points, None)
+        return tally.lower, tally.upper
+
+    def add_from_runs(self, runs: Runs, partition: Partition, n_total: int) -> None:
+        if partition.fits:
+            with self.timed("load"):
+                points, keys = runs.load(partition)
+            self.add_partition(points, keys, partition.level, partition.code, n_total)
+            return
+        with self.timed("write"):
+            cells, root_set = append_streamed_leaf(
+                partition, runs, self.memory.capacity, self.settings.points_per_cell, self.array, self.workers
+            )
+            self.assembly.add(cells, root_set)
+
+    def add_partition(self, points: PointBatch, keys: np.ndarray, level: int, code: int, n_total: int) -> None:
+        order = self.settings.point_order
+        with self.timed("sort"):
+            subtree = build_subtree(keys, points.attributes.get("normal"), level, code, self.rule, order, self.workers)
+        with self.timed("write"):
+            done, share = self.assembly.n_points, len(points) / len(subtree.stored)
+            cells, owners = subtree.cells, subtree.owners
+            cells.first_point += self.array.n_stored
+            first_set = subtree.stored[: min(int(cells.n_points[0]), self.settings.points_per_cell)]
+            self.assembly.add(cells, points.select(first_set))
+            self.array.append(
+                points,
+                subtree.stored,
+                cells.level[owners],
+                cells.code[owners],
+                cells.n_points[owners],
+                self.workers,
+                lambda n_stored: self.progress("write", done + int(n_stored * share), n_total),
+            )
+
+    def finish(self, origin: np.ndarray, edge: float, tally: Tally) -> SceneInfo:
+        """Write the cells, the blocks and ``scene.json``, and put the scene in its place."""
+        cells = self.assembly.cell_arrays("normal" in self.attributes)
+        first, block_origin = self.array.blocks()
+        for name, values in {**cells, "block_first_point": first, "block_origin": block_origin}.items():
+            self.writer.write_array(name, values)
         info = SceneInfo(
-            point_order=settings.point_order,
-            origin=tuple(origin.tolist()),
+            point_order=self.settings.point_order,
+            origin=_triple(origin),
             edge=edge,
-            lower=tuple(tally.lower.tolist()),
-            upper=tuple(tally.upper.tolist()),
+            lower=_triple(tally.lower),
+            upper=_triple(tally.upper),
             n_points=tally.n_points,
-            n_stored=array.n_stored,
+            n_stored=self.array.n_stored,
             n_cells=len(cells["cell_level"]),
             n_blocks=len(first),
             n_dropped=tally.n_dropped,
-            attributes=kept,
-            block_levels=levels,
-            up=settings.up,
-            crs=next((s.info.crs for s in inputs if s.info.crs), None),
-            sources=tuple(SourceCount(s.info.path.name, n) for s, n in zip(inputs, tally.source_points, strict=True)),
-            build=settings_json(settings),
-            arrays=arrays,
+            attributes=self.attributes,
+            block_levels=block_levels_of(self.settings.points_per_cell),
+            up=self.settings.up,
+            crs=next((s.info.crs for s in self.sources if s.info.crs), None),
+            sources=tuple(
+                SourceCount(source.info.path.name, n)
+                for source, n in zip(self.sources, tally.source_points, strict=True)
+            ),
+            build=settings_json(self.settings),
+            arrays=self.writer.close_columns(),
         )
-        writer.commit(info)
-        stage_s["finish"] = time.perf_counter() - clock
-    return BuildReport(
-        Path(out),
-        info.n_points,
-        info.n_stored,
-        info.n_cells,
-        info.n_dropped,
-        dropped,
-        assembly.n_partitions,
-        0,
-        sum(a.bytes for a in arrays.values()),
-        stage_s,
-    )
+        self.writer.commit(info)
+        return info
 
 
-def add_partition(subtree, points: PointBatch, array, assembly, settings, workers) -> None:
-    cells = subtree.cells
-    owners = np.arange(len(cells))
-    if settings.point_order == "depth-first":
-        owners = np.flatnonzero(cells.first_child < 0)
-        owners = owners[np.argsort(cells.first_point[owners])]
-    root_set = points.select(subtree.stored[: min(int(cells.n_points[0]), settings.points_per_cell)])
-    first = array.n_stored
-    array.append(points, subtree.stored, cells.level[owners], cells.code[owners], cells.n_points[owners], workers)
-    cells.first_point += first
-    assembly.add(cells, root_set)
+def _triple(values: np.ndarray) -> tuple[float, float, float]:
+    x, y, z = values.tolist()
+    return x, y, z

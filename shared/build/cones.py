@@ -29,33 +29,50 @@ def _unpack(word, out):
 
 
 @njit(nogil=True, cache=True)
-def _leaf_cones(which, first_point, n_points, stored, normals, total, cone):
-    """Sum of normals, and axis with cosine over the points of each given leaf; cosine −1 if a normal is missing."""
+def add_normals(words, stored, begin, end, total):
+    """Add the normals of ``words[stored[begin:end]]`` to (3,) ``total``; False if one is missing."""
     normal = np.empty(3)
+    for j in range(begin, end):
+        word = np.int64(words[stored[j]])
+        if word == _NO_NORMAL:
+            return False
+        _unpack(word, normal)
+        for axis in range(3):
+            total[axis] += normal[axis]
+    return True
+
+
+@njit(nogil=True, cache=True)
+def start_cone(total, cone):
+    """Set (4,) ``cone`` to the axis of (3,) ``total`` with cosine 1, or to "any direction"; True for an axis."""
+    length = np.sqrt(total[0] ** 2 + total[1] ** 2 + total[2] ** 2)
+    cone[3] = -1.0
+    if not length > 0.0:
+        return False
+    for axis in range(3):
+        cone[axis] = total[axis] / length
+    cone[3] = 1.0
+    return True
+
+
+@njit(nogil=True, cache=True)
+def widen_cone(words, stored, begin, end, cone):
+    """Lower the cosine of (4,) ``cone`` until it holds the normals of ``words[stored[begin:end]]``."""
+    normal = np.empty(3)
+    for j in range(begin, end):
+        _unpack(np.int64(words[stored[j]]), normal)
+        cone[3] = min(cone[3], normal[0] * cone[0] + normal[1] * cone[1] + normal[2] * cone[2])
+
+
+@njit(nogil=True, cache=True)
+def _leaf_cones(which, first_point, n_points, stored, words, total, cone):
     for k in range(len(which)):
         cell = which[k]
         begin, end = first_point[cell], first_point[cell] + n_points[cell]
-        complete = True
-        for j in range(begin, end):
-            word = np.int64(normals[stored[j]])
-            if word == _NO_NORMAL:
-                complete = False
-                break
-            _unpack(word, normal)
-            for axis in range(3):
-                total[cell, axis] += normal[axis]
-        length = np.sqrt(total[cell, 0] ** 2 + total[cell, 1] ** 2 + total[cell, 2] ** 2)
-        cone[cell, 3] = -1.0
-        if not complete or not length > 0.0:
+        if not add_normals(words, stored, begin, end, total[cell]):
             total[cell, :] = 0.0
-            continue
-        cosine = 1.0
-        for axis in range(3):
-            cone[cell, axis] = total[cell, axis] / length
-        for j in range(begin, end):
-            _unpack(np.int64(normals[stored[j]]), normal)
-            cosine = min(cosine, normal[0] * cone[cell, 0] + normal[1] * cone[cell, 1] + normal[2] * cone[cell, 2])
-        cone[cell, 3] = cosine
+        if start_cone(total[cell], cone[cell]):
+            widen_cone(words, stored, begin, end, cone[cell])
 
 
 def leaf_cones(
@@ -84,13 +101,12 @@ def _merge(first_child, n_children, total, cone):
             complete = complete and cone[child, 3] > -1.0
             for axis in range(3):
                 total[cell, axis] += total[child, axis]
-        length = np.sqrt(total[cell, 0] ** 2 + total[cell, 1] ** 2 + total[cell, 2] ** 2)
-        cone[cell, 3] = -1.0
-        if not complete or not length > 0.0:
+        if not complete:
+            cone[cell, 3] = -1.0
+            continue
+        if not start_cone(total[cell], cone[cell]):
             continue
         half_angle = 0.0
-        for axis in range(3):
-            cone[cell, axis] = total[cell, axis] / length
         for child in range(first_child[cell], first_child[cell] + n_children[cell]):
             between = cone[child, 0] * cone[cell, 0] + cone[child, 1] * cone[cell, 1] + cone[child, 2] * cone[cell, 2]
             angle = np.arccos(min(1.0, max(-1.0, between))) + np.arccos(min(1.0, max(-1.0, cone[child, 3])))

@@ -43,6 +43,36 @@ class Tally:
         return sum(self.source_points)
 
 
+Bounds = tuple[np.ndarray, np.ndarray]
+_BOUNDS_TOLERANCE = 2.0**-10
+
+
+def declared_bounds(sources: list[Source]) -> Bounds | None:
+    """(lower, upper) that holds the bounds of all headers, or None if one of them states none that is finite."""
+    bounds = []
+    for info in (source.info for source in sources):
+        if info.lower is None or info.upper is None:
+            return None
+        bounds.append((info.lower, info.upper))
+    lower, upper = np.min([b[0] for b in bounds], axis=0), np.max([b[1] for b in bounds], axis=0)
+    return (lower, upper) if np.isfinite([lower, upper]).all() and (lower <= upper).all() else None
+
+
+def root_bounds(declared: Bounds | None, tally: Tally) -> Bounds:
+    """The bounds that the root cube is made from: the headers', if the points agree with them, else the points'.
+
+    Headers agree if they hold the points (but for rounding) and are not wider by more than a thousandth of the largest
+    extent: the cube is then known before the points are read, and is the same whether or not they fit into memory.
+    """
+    tight = tally.lower, tally.upper
+    if declared is None:
+        return tight
+    rounding = 4 * np.spacing(np.max(np.abs(tight)))
+    tolerance = _BOUNDS_TOLERANCE * np.max(tally.upper - tally.lower)
+    wider = np.array([tally.lower - declared[0], declared[1] - tally.upper])
+    return declared if ((wider >= -rounding) & (wider <= tolerance)).all() else tight
+
+
 def finite_batches(
     sources: list[Source], attributes: tuple[str, ...], max_points: int, strict: bool, tally: Tally
 ) -> Iterator[PointBatch]:
@@ -94,6 +124,10 @@ class Columns:
     def points(self) -> PointBatch:
         """What has been added: views."""
         return self._columns.select(slice(0, self.n_points))
+
+    def whole(self) -> PointBatch:
+        """All of the memory, to be filled by the caller."""
+        return self._columns
 
     def clear(self) -> None:
         """Forget the points and keep the memory."""

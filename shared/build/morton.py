@@ -14,6 +14,7 @@ from numba import njit
 
 from ..errors import InputError
 from ..octree import MAX_LEVEL
+from .parallel import Workers
 
 _EDGE_BITS = 12
 _LAST = (1 << MAX_LEVEL) - 1
@@ -37,7 +38,7 @@ def root_cube(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 @njit(nogil=True, cache=True)
-def spread_bits(x: int) -> int:
+def spread_bits(x):
     """The low 21 bits of an int64, two zero bits between each."""
     x &= 0x1FFFFF
     x = (x | (x << 32)) & 0x001F00000000FFFF
@@ -48,7 +49,7 @@ def spread_bits(x: int) -> int:
 
 
 @njit(nogil=True, cache=True)
-def compact_bits(x: int) -> int:
+def compact_bits(x):
     """Inverse of ``spread_bits``: every third bit."""
     x &= 0x1249249249249249
     x = (x ^ (x >> 2)) & 0x10C30C30C30C30C3
@@ -70,6 +71,14 @@ def morton_keys(positions, origin, scale, start, stop, keys):
             cell = np.int64(min(max((positions[i, axis] - origin[axis]) * scale, 0.0), float(_LAST)))
             key |= spread_bits(cell) << axis
         keys[i] = key
+
+
+def keys_of(positions: np.ndarray, origin: np.ndarray, edge: float, workers: Workers) -> np.ndarray:
+    """(n,) int64 Morton keys of (n, 3) finite positions."""
+    keys = np.empty(len(positions), np.int64)
+    scale = 2.0**MAX_LEVEL / edge
+    workers.map(morton_keys, [(positions, origin, scale, a, b, keys) for a, b in workers.ranges(len(keys))])
+    return keys
 
 
 @njit(nogil=True, cache=True)

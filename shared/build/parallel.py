@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from typing import Any
 
 
@@ -32,4 +33,4 @@ class Workers:
         """[0, n) in at most ``pieces`` (one per thread) contiguous non-empty ranges of nearly equal length."""
         pieces = max(1, min(pieces or self.n_threads, n))
         cuts = [n * i // pieces for i in range(pieces + 1)]
-        return list(zip(cuts[:-1], cuts[1:], strict=True)) if n else []
+        return list(pairwise(cuts)) if n else []

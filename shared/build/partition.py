@@ -227,15 +227,12 @@ def subtree_cells(
     todo = upper.take(np.flatnonzero(upper.split & (upper.level == lowest)))
     scratch = np.empty_like(ids)
     parts = [upper]
-    for piece in workers.map(
-        refine,
-        [
-            (keys, ids, scratch, part.code, part.start, part.start + part.count, lowest)
-            + (rule.points_per_cell, rule.max_depth, rule.flatness)
-            for part in _balanced(todo, 8 * workers.n_threads)
-        ],
-    ):
-        parts.append(Cells(*piece))
+    limits = (rule.points_per_cell, rule.max_depth, rule.flatness)
+    tasks = [
+        (keys, ids, scratch, part.code, part.start, part.start + part.count, lowest, *limits)
+        for part in _balanced(todo, 8 * workers.n_threads)
+    ]
+    parts += [Cells(*below) for below in workers.map(refine, tasks)]
     return Cells.concatenate(parts), ids
 
 

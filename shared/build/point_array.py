@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numba import njit
 
@@ -54,6 +56,7 @@ class PointArrayWriter:
         self, writer: SceneWriter, attributes: tuple[str, ...], origin: np.ndarray, edge: float, block_levels: int
     ) -> None:
         self.n_stored = 0
+        self.attributes = attributes
         self._writer = writer
         self._origin, self._edge, self._levels = origin, edge, block_levels
         self._xyz = [writer.open_column(name, np.dtype("<f4")) for name in "xyz"]
@@ -70,15 +73,17 @@ class PointArrayWriter:
         code: np.ndarray,
         n_points: np.ndarray,
         workers: Workers,
+        advance: Callable[[int], None] | None = None,
     ) -> None:
         """Append ``points`` picked by ``stored``.
 
         stored : (m,) uint32 indices of points.
         level, code, n_points : the cells that own them, one after another, n_points sums up to m.
+        advance : called with the points written of these.
         """
         first, origin = self._open_blocks(level, code, n_points)
         with writing(self._writer.partial):
-            tasks = [(self._append_positions, points.positions, stored, first, origin)]
+            tasks = [(self._append_positions, points.positions, stored, first, origin, advance)]
             tasks += [(self._append_column, name, column, stored) for name, column in points.attributes.items()]
             workers.map(lambda task, *arguments: task(*arguments), tasks)
         self.n_stored += len(stored)
@@ -98,13 +103,15 @@ class PointArrayWriter:
         self._last_block = blocks[-1]
         return first, origin
 
-    def _append_positions(self, positions, stored, first, origin) -> None:
+    def _append_positions(self, positions, stored, first, origin, advance) -> None:
         xyz = np.empty((3, min(_CHUNK, len(stored))), np.float32)
         for begin in range(0, len(stored), _CHUNK):
             end = min(begin + _CHUNK, len(stored))
             _gather_positions(positions, stored, begin, end, first, origin, *xyz)
             for file, column in zip(self._xyz, xyz, strict=True):
                 file.write(column[: end - begin])
+            if advance:
+                advance(end)
 
     def _append_column(self, name: str, column: np.ndarray, stored: np.ndarray) -> None:
         out = np.empty(min(_CHUNK, len(stored)), column.dtype)

@@ -7,10 +7,15 @@ ordered without ever being held.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numba import njit
 
 from .parallel import Workers
+
+if TYPE_CHECKING:
+    from .subtree import LinkedCells
 
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
@@ -129,16 +134,11 @@ def set_sizes(level, first_child, n_children, count, capacity: int) -> np.ndarra
     return sizes
 
 
-def sample_inner(tree, capacity: int, stored: np.ndarray, workers: Workers) -> None:
-    """Fill the sets of every inner cell of ``tree`` (a LinkedCells), deepest level first; the leaves' sets are there."""
+def sample_inner(tree: LinkedCells, capacity: int, stored: np.ndarray, workers: Workers) -> None:
+    """Fill the sets of every inner cell, deepest level first; those of the leaves are there."""
     inner = np.flatnonzero(tree.first_child >= 0)
     for at in np.unique(tree.level[inner])[::-1]:
         cells = inner[tree.level[inner] == at]
-        workers.map(
-            sample_children,
-            [
-                (cells[a:b], tree.level, tree.code, tree.first_child, tree.n_children)
-                + (tree.first_point, tree.n_points, capacity, stored)
-                for a, b in workers.ranges(len(cells), pieces=4 * workers.n_threads)
-            ],
-        )
+        links = (tree.level, tree.code, tree.first_child, tree.n_children, tree.first_point, tree.n_points)
+        pieces = workers.ranges(len(cells), pieces=4 * workers.n_threads)
+        workers.map(sample_children, [(cells[a:b], *links, capacity, stored) for a, b in pieces])

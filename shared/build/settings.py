@@ -9,9 +9,7 @@ from pathlib import Path
 from ..errors import InputError
 from ..octree import MAX_LEVEL
 from ..points import ATTRIBUTES
-from ..scene_info import POINT_ORDERS
-
-UP_AXES = ("x", "y", "z", "auto")
+from ..scene_info import POINT_ORDERS, UP_AXES
 
 
 @dataclass(frozen=True)
@@ -25,7 +23,7 @@ class BuildSettings:
     memory_bytes : peak memory of the process; None for half of what is available.
     strict : refuse coordinates that are not finite, instead of dropping the point.
     overwrite : replace an existing scene, once the new one is whole.
-    up : axis that points up, stored in the scene: ``x``, ``y``, ``z`` or ``auto``.
+    up : axis that points up, stored in the scene: one of ``UP_AXES``.
     attributes : the ones to keep; None for all.
     threads : None for one a core.
 
@@ -124,3 +122,37 @@ def resident_bytes() -> int:
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except OSError:
         return 0
+
+
+@dataclass(frozen=True)
+class MemoryPlan:
+    """How many points are held at a time. capacity : points of a partition.  batch : points asked of a reader."""
+
+    capacity: int
+    batch: int
+
+
+_FIXED_BYTES = 64 << 20
+"""Counters of the counting sort, chunks on their way to files, cells: what does not grow with the points held."""
+_SORT_BYTES = 8 + 4 + 4 + 10
+"""A point's key, its index, a second index while cells are refined, and two and a half stored indices (layered)."""
+_READER_BYTES = 320
+"""A point in a reader: file bytes, decoded columns and temporaries, one batch ahead."""
+_MIN_CAPACITY = 1 << 16
+_MAX_BATCH = 1 << 19
+
+
+def plan_memory(settings: BuildSettings, attributes: tuple[str, ...]) -> MemoryPlan:
+    """Divide the memory that the process does not hold yet between readers and points.
+
+    Raises InputError if it is too little for a partition of a few cells.
+    """
+    budget = settings.memory_bytes or available_memory_bytes() // 2
+    point_bytes = 24 + sum(ATTRIBUTES[a].itemsize for a in attributes) + _SORT_BYTES
+    left = budget - resident_bytes() - _FIXED_BYTES
+    capacity = min(left * 3 // 4 // point_bytes, 2**32 - 1)
+    needed = max(_MIN_CAPACITY, 2 * settings.points_per_cell)
+    if capacity < needed:
+        at_least = budget - left + needed * point_bytes * 4 // 3
+        raise InputError(f"build: memory_bytes = {budget}, expected at least {at_least} for this process")
+    return MemoryPlan(capacity, max(1, min(left // 4 // _READER_BYTES, _MAX_BATCH)))

@@ -65,10 +65,12 @@ class Subtree:
 
     stored : (m,) uint32, the index of each stored point among the partition's points; ``cells.first_point`` counts
         from the partition's first stored point.
+    owners : indices of the cells that own points, in the order of their ranges.
     """
 
     cells: LinkedCells
     stored: np.ndarray
+    owners: np.ndarray
 
 
 def build_subtree(
@@ -94,9 +96,11 @@ def build_subtree(
         )
         cells.first_point = np.cumsum(cells.n_points) - cells.n_points
         stored = np.empty(int(cells.n_points.sum()), np.uint32)
+        owners = np.arange(len(cells))
     else:
         cells.n_points, cells.first_point = cells.count.copy(), cells.start.copy()
         stored = np.empty(len(keys), np.uint32)
+        owners = leaves[np.argsort(cells.first_point[leaves])]
     ends = np.cumsum(cells.count[leaves])
     cuts = np.searchsorted(ends, [b for _, b in workers.ranges(int(ends[-1]), pieces=8 * workers.n_threads)][:-1])
     workers.map(
@@ -110,4 +114,4 @@ def build_subtree(
         sample_inner(cells, rule.points_per_cell, stored, workers)
     if normals is not None:
         cells.normal_sum, cells.cone = leaf_cones(cells, normals, stored, workers)
-    return Subtree(cells, stored)
+    return Subtree(cells, stored, owners)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import fcntl
 import os
 import shutil
@@ -15,9 +14,8 @@ from typing import IO, Any
 import numpy as np
 
 from ..errors import InputError
+from ..files import disk_error
 from ..scene_info import SCENE_FILE, ArrayInfo, SceneInfo
-
-_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 
 @contextmanager
@@ -26,8 +24,16 @@ def writing(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        cause = "disk full" if error.errno in _FULL else error.strerror or str(error)
-        raise InputError(f"{error.filename or path}: cannot be written: {cause}") from error
+        raise disk_error(error, path) from error
+
+
+def write_all(file: IO[bytes], rows: np.ndarray) -> memoryview:
+    """Write a C-contiguous array to an unbuffered file; return the bytes written."""
+    data = rows.reshape(-1).view(np.uint8).data
+    left = data
+    while left:
+        left = left[file.write(left) :]
+    return data
 
 
 class ColumnFile:
@@ -51,10 +57,7 @@ class ColumnFile:
 
     def write(self, rows: np.ndarray) -> None:
         """Append C-contiguous rows."""
-        data = memoryview(rows.view(np.uint8)).cast("B") if rows.size else b""
-        self._crc = zlib.crc32(data, self._crc)
-        while data:
-            data = data[self._file.write(data) :]
+        self._crc = zlib.crc32(write_all(self._file, rows), self._crc)
         self._rows += len(rows)
 
     def close(self) -> ArrayInfo:

@@ -1,0 +1,249 @@
+"""Points that do not fit into memory: sorted runs on disk, and the partitions that do fit.
+
+Every batch that fills the memory is sorted stably by bucket (``partition.BUCKET_LEVEL``) and written as one *run*, a
+raw file a column. A *partition* is a cell of the octree whose points fit; they are the same slice of every run, or,
+below the bucket level, the points of that slice whose key has the cell's code for a prefix. Read run after run they
+stand in the order that one sort in memory would have given them: the scene does not depend on the memory it was built
+in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numba import njit
+
+from ..octree import MAX_LEVEL
+from ..points import ATTRIBUTES, PointBatch
+from .flatness import N_MOMENTS, add_moments, bucket_moments, central_moments, flatness
+from .ingest import Columns
+from .morton import count_buckets, keys_of
+from .parallel import Workers
+from .partition import BUCKET_LEVEL, Subdivision, sort_into_buckets, upper_cells
+from .writer import write_all, writing
+
+_CHUNK = 1 << 17
+_N_BUCKETS = 8**BUCKET_LEVEL
+_STEP = 3
+"""Levels that one pass over an oversize cell below the bucket level looks ahead."""
+
+
+@dataclass(frozen=True)
+class Partition:
+    """A cell, and whether its points fit into memory; if not, it is a leaf and its points are streamed."""
+
+    level: int
+    code: int
+    n_points: int
+    fits: bool
+
+
+@njit(nogil=True, cache=True)
+def _gather_rows(positions, ids, begin, end, out):
+    for j in range(begin, end):
+        for axis in range(3):
+            out[j - begin, axis] = positions[ids[j], axis]
+
+
+class Runs:
+    """Sorted runs in a directory of their own, which the owner of the scene's directory removes.
+
+    origin, edge : the root cube, which holds all points.
+    Raises InputError if the disk is full.
+    """
+
+    def __init__(
+        self,
+        directory: Path,
+        attributes: tuple[str, ...],
+        origin: np.ndarray,
+        edge: float,
+        rule: Subdivision,
+        workers: Workers,
+    ) -> None:
+        self._directory = directory
+        self._attributes = attributes
+        self._origin, self._edge = origin, edge
+        self._rule = rule
+        self._workers = workers
+        self._run_sizes: list[int] = []
+        self._counts = np.zeros(_N_BUCKETS, np.int64)
+        self._moments = np.zeros((_N_BUCKETS, N_MOMENTS), np.int64) if rule.flatness > 0 else None
+        self._ahead: dict[tuple[int, int], np.ndarray] = {}
+        self.bytes = 0
+        with writing(directory):
+            directory.mkdir()
+
+    def add(self, points: PointBatch) -> None:
+        """Sort points and write them as a run. Memory: 12 bytes a point and a chunk a column."""
+        keys = self._keys(points)
+        ids, first = sort_into_buckets(keys, BUCKET_LEVEL, 0, _N_BUCKETS, self._workers)
+        self._counts += np.diff(first)
+        if self._moments is not None:
+            pieces = self._workers.ranges(_N_BUCKETS)
+            self._workers.map(
+                bucket_moments, [(keys, ids, first, a, b, BUCKET_LEVEL, self._moments) for a, b in pieces]
+            )
+        run = len(self._run_sizes)
+        with writing(self._directory):
+            first.tofile(self._file(run, "first"))
+            columns = {"positions": points.positions, **points.attributes}
+            self._workers.map(self._write_column, [(run, name, column, ids) for name, column in columns.items()])
+        self._run_sizes.append(len(ids))
+        self.bytes += first.nbytes + sum(column.nbytes for column in columns.values())
+
+    def built_for(self, origin: np.ndarray, edge: float) -> bool:
+        """Whether the runs are sorted in this root cube."""
+        return bool((origin == self._origin).all()) and edge == self._edge
+
+    def discard(self) -> None:
+        """Remove the files."""
+        for file in self._directory.iterdir():
+            file.unlink()
+        self._directory.rmdir()
+
+    def _write_column(self, run: int, name: str, column: np.ndarray, ids: np.ndarray) -> None:
+        out = np.empty((_CHUNK, *column.shape[1:]), column.dtype)
+        with open(self._file(run, name), "wb", buffering=0) as file:
+            for begin in range(0, len(ids), _CHUNK):
+                end = min(begin + _CHUNK, len(ids))
+                if column.ndim == 2:
+                    _gather_rows(column, ids, begin, end, out)
+                else:
+                    np.take(column, ids[begin:end], out=out[: end - begin], mode="clip")
+                write_all(file, out[: end - begin])
+
+    def _file(self, run: int, name: str) -> Path:
+        return self._directory / f"{run:05d}.{name}"
+
+    def partitions(self, capacity: int) -> Iterator[Partition]:
+        """Cells in Morton order that hold all points, each of at most ``capacity`` points or an oversize leaf.
+
+        Cost: where a cell of the bucket level is oversize, a pass over its points for every three levels below.
+        """
+        first = np.zeros(_N_BUCKETS + 1, np.int64)
+        np.cumsum(self._counts, out=first[1:])
+        cells = upper_cells(0, 0, first, self._moments, self._rule)
+        oversize = cells.take(np.flatnonzero(cells.count > capacity))
+        split = dict(
+            zip(zip(oversize.level.tolist(), oversize.code.tolist(), strict=True), oversize.split, strict=True)
+        )
+
+        def below(level: int, code: int) -> Iterator[Partition]:
+            width = 3 * (BUCKET_LEVEL - level)
+            if width >= 0:
+                n = int(first[(code + 1) << width] - first[code << width])
+            else:
+                n = self._count(level, code)
+            if n == 0:
+                return
+            if n <= capacity:
+                yield Partition(level, code, n, fits=True)
+            elif split[level, code] if width >= 0 else self._splits(level, code, n):
+                for octant in range(8):
+                    yield from below(level + 1, code << 3 | octant)
+            else:
+                yield Partition(level, code, n, fits=False)
+
+        yield from below(0, 0)
+
+    def _count(self, level: int, code: int) -> int:
+        """Points of a cell below the bucket level, from a histogram under the ancestor that is looked ahead from."""
+        ahead = BUCKET_LEVEL + (level - 1 - BUCKET_LEVEL) // _STEP * _STEP
+        lowest = min(ahead + _STEP, MAX_LEVEL)
+        ancestor = code >> 3 * (level - ahead)
+        if (ahead, ancestor) not in self._ahead:
+            counts = np.zeros(8 ** (lowest - ahead), np.int64)
+            for keys in map(self._keys, self.stream(ahead, ancestor, ())):
+                base = ancestor << 3 * (lowest - ahead)
+                count_buckets(keys, 0, len(keys), 3 * (MAX_LEVEL - lowest), base, counts)
+            self._ahead[ahead, ancestor] = counts
+        width = 3 * (lowest - level)
+        at = (code << width) - (ancestor << 3 * (lowest - ahead))
+        return int(self._ahead[ahead, ancestor][at : at + (1 << width)].sum())
+
+    def _splits(self, level: int, code: int, n: int) -> bool:
+        if not self._rule.counts_allow(n, level):
+            return False
+        if not self._rule.flatness > 0:
+            return True
+        moments, central = np.zeros(N_MOMENTS, np.int64), np.empty(N_MOMENTS)
+        for keys in map(self._keys, self.stream(level, code, ())):
+            add_moments(keys, np.arange(len(keys), dtype=np.uint32), 0, len(keys), level, moments)
+        central_moments(moments, central)
+        return bool(flatness(central) >= self._rule.flatness)
+
+    def load(self, partition: Partition) -> tuple[PointBatch, np.ndarray]:
+        """(points, keys) of a partition that fits."""
+        columns = Columns(partition.n_points, self._attributes)
+        if partition.level > BUCKET_LEVEL:
+            for batch in self.stream(partition.level, partition.code):
+                columns.add(batch)
+            points = columns.points()
+        else:
+            points = columns.whole()
+            slices = self._slices(partition.level, partition.code)
+            out = {"positions": points.positions, **points.attributes}
+            self._workers.map(self._read_slices, [(name, slices, column) for name, column in out.items()])
+        return points, self._keys(points)
+
+    def stream(self, level: int, code: int, attributes: tuple[str, ...] | None = None) -> Iterator[PointBatch]:
+        """The points of a cell in the order of one sort in memory, in small batches; all attributes or some."""
+        wanted = self._attributes if attributes is None else attributes
+        above = max(level - BUCKET_LEVEL, 0)
+        for run, start, stop in self._slices(level - above, code >> 3 * above, by_bucket=True):
+            for begin in range(start, stop, _CHUNK):
+                end = min(begin + _CHUNK, stop)
+                batch = PointBatch(self._read(run, "positions", begin, end, np.empty((end - begin, 3))))
+                inside = np.ones(end - begin, bool)
+                if above:
+                    inside = self._keys(batch) >> 3 * (MAX_LEVEL - level) == code
+                if not inside.any():
+                    continue
+                for name in wanted:
+                    batch.attributes[name] = self._read(run, name, begin, end, np.empty(end - begin, ATTRIBUTES[name]))
+                yield batch.select(inside)
+
+    def _keys(self, points: PointBatch) -> np.ndarray:
+        return keys_of(points.positions, self._origin, self._edge, self._workers)
+
+    def _slices(self, level: int, code: int, *, by_bucket: bool = False) -> list[tuple[int, int, int]]:
+        """(run, start, stop) of a cell of at most the bucket level: one a run, or one a bucket and run."""
+        width = 3 * (BUCKET_LEVEL - level)
+        begin, count = code << width, (1 << width) + 1
+        if not by_bucket:
+            ends = [
+                [
+                    int(np.fromfile(self._file(run, "first"), "<i8", 1, offset=8 * b)[0])
+                    for b in (begin, begin + count - 1)
+                ]
+                for run in range(len(self._run_sizes))
+            ]
+            return [(run, start, stop) for run, (start, stop) in enumerate(ends)]
+        first = [
+            np.fromfile(self._file(run, "first"), "<i8", count, offset=8 * begin) for run in range(len(self._run_sizes))
+        ]
+        buckets, runs = np.nonzero(np.diff(first, axis=1).T)
+        return [(int(r), int(first[r][b]), int(first[r][b + 1])) for b, r in zip(buckets, runs, strict=True)]
+
+    def _read_slices(self, name: str, slices: list[tuple[int, int, int]], out: np.ndarray) -> None:
+        at = 0
+        for run, start, stop in slices:
+            self._read(run, name, start, stop, out[at : at + stop - start])
+            at += stop - start
+
+    def _read(self, run: int, name: str, start: int, stop: int, out: np.ndarray) -> np.ndarray:
+        """Fill ``out``, C-contiguous, with rows [start, stop) of a run's column."""
+        if stop > start:
+            data = out.reshape(-1).view(np.uint8).data
+            with open(self._file(run, name), "rb", buffering=0) as file:
+                file.seek(start * (out.nbytes // len(out)))
+                while data:
+                    n_read = file.readinto(data)
+                    if not n_read:
+                        raise OSError(f"{file.name}: ended early")
+                    data = data[n_read:]
+        return out

@@ -1,0 +1,84 @@
+"""A leaf that does not fit into memory: millions of coincident points, or a flat region, written window by window."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from ..points import PointBatch
+from .cones import add_normals, start_cone, widen_cone
+from .ingest import Columns
+from .parallel import Workers
+from .point_array import PointArrayWriter
+from .runs import Partition, Runs
+from .sets import permutation, place
+from .subtree import LinkedCells
+
+
+@njit(nogil=True, cache=True)
+def _placed_in_window(first, n_batch, n, p, begin, end, source, target):
+    found = 0
+    for i in range(n_batch):
+        j = place(first + i, n, p)
+        if begin <= j < end:
+            source[found], target[found] = i, j - begin
+            found += 1
+    return found
+
+
+def append_streamed_leaf(
+    leaf: Partition,
+    runs: Runs,
+    capacity: int,
+    set_size: int,
+    array: PointArrayWriter,
+    workers: Workers,
+) -> tuple[LinkedCells, PointBatch]:
+    """Append the points of an oversize leaf in the order of its permutation: (its cell, its first ``set_size`` points).
+
+    Cost: one pass over the leaf's points for every ``capacity`` points, and one more where there are normals.
+    """
+    n = leaf.n_points
+    p = np.empty(6, np.uint64)
+    permutation(leaf.level, leaf.code, n, p)
+    first_point = array.n_stored
+    level, code = np.array([leaf.level], np.uint8), np.array([leaf.code], np.int64)
+    total, cone = np.zeros(3), np.zeros(4)
+    first_set, complete = None, True
+    for begin in range(0, n, capacity):
+        end = min(begin + capacity, n)
+        window = Columns(end - begin, array.attributes).whole()
+        read = 0
+        for batch in runs.stream(leaf.level, leaf.code):
+            source, target = np.empty((2, len(batch)), np.int64)
+            found = _placed_in_window(read, len(batch), n, p, begin, end, source, target)
+            source, target = source[:found], target[:found]
+            window.positions[target] = batch.positions[source]
+            for name, column in window.attributes.items():
+                column[target] = batch.attributes[name][source]
+            read += len(batch)
+        in_order = np.arange(end - begin, dtype=np.uint32)
+        array.append(window, in_order, level, code, np.array([end - begin]), workers)
+        if first_set is None:
+            first_set = window.select(np.arange(min(set_size, end - begin)))
+        if "normal" in window.attributes and complete:
+            complete = add_normals(window.attributes["normal"], in_order, 0, end - begin, total)
+    assert first_set is not None
+    if "normal" in array.attributes and start_cone(total if complete else np.zeros(3), cone):
+        for batch in runs.stream(leaf.level, leaf.code):
+            widen_cone(batch.attributes["normal"], np.arange(len(batch), dtype=np.uint32), 0, len(batch), cone)
+    one = np.zeros(1, np.int64)
+    cells = LinkedCells(
+        level=level,
+        code=code,
+        parent=one - 1,
+        first_child=one - 1,
+        n_children=one,
+        count=one + n,
+        start=one,
+        first_point=one + first_point,
+        n_points=one + n,
+        normal_sum=(total if complete else np.zeros(3))[None],
+        cone=cone[None],
+    )
+    return cells, first_set
