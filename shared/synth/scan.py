@@ -153,9 +153,8 @@ class CityScan(Source):
         positions, normals, patch = self._surfaces.points(which, np.arange(start, stop) - first[which])
         x, y, z = positions
         ground = height(x, y)
-        standing = np.where(
-            self._material[which] == Material.WATER, z, np.maximum(z, ground)
-        )  # walls end at the ground
+        # Walls end at the ground; only the pond lies below it.
+        standing = np.where(self._material[which] == Material.WATER, z, np.maximum(z, ground))
         positions[2] = np.where(self._draped[which], z + ground, standing)
         return which, positions, normals, patch
 
