@@ -16,7 +16,7 @@ import numpy as np
 from .camera_path import up_vector
 from .errors import ConfigError
 from .messages import FRAMEBUFFER_EMPTY
-from .points import pack_rgb, unpack_normals
+from .points import NO_NORMAL, pack_rgb, unpack_normals
 from .store import Scene
 
 MODES = ("auto", "rgb", "intensity", "elevation", "classification", "level", "normal")
@@ -112,8 +112,9 @@ def colour_words(scene: Scene, colouring: Colouring) -> np.ndarray:
             codes = scene.attribute("classification")
             return _by_chunk(n, lambda part: palette[codes[part]])
         case "normal":
-            normals, up = scene.attribute("normal"), up_vector(scene.info)
-            return _by_chunk(n, lambda part: shade(unpack_normals(normals[part]), up))
+            normals, table = scene.attribute("normal"), _shade_table(up_vector(scene.info))
+            bare = shade(np.zeros((1, 3), np.float32), up_vector(scene.info))
+            return _by_chunk(n, lambda part: _shade_words(normals[part], table, bare))
         case mode:
             values = _scalars(scene, mode)
             low, high = colouring.value_range or _robust_range(values, n)
@@ -126,11 +127,11 @@ def map_scalars(values: np.ndarray, low: float, high: float, table: np.ndarray) 
 
     Where low equals high, the table's middle colour.
     """
-    if low == high:
+    half_span = high / 2 - low / 2  # halves, so that no range overflows
+    if half_span == 0:
         return np.full(len(values), table[len(table) // 2])
-    share = (values.astype(np.float64) - low) * (1.0 / (high - low))
-    index = np.clip(np.nan_to_num(share, nan=0.0, posinf=1.0, neginf=0.0), 0.0, 1.0) * (len(table) - 1)
-    return table[np.rint(index).astype(np.uint8)]
+    inside = np.clip(np.nan_to_num(values.astype(np.float64), nan=low), min(low, high), max(low, high))
+    return table[np.rint((inside / 2 - low / 2) / half_span * (len(table) - 1)).astype(np.uint8)]
 
 
 def shade(normals: np.ndarray, up: np.ndarray) -> np.ndarray:
@@ -150,6 +151,17 @@ def shade(normals: np.ndarray, up: np.ndarray) -> np.ndarray:
     lit[~normals.any(axis=1)] = 0.5
     channels = [lit * warm + cool * tint for warm, tint in ((1.0, 0.8), (0.955, 0.9), (0.89, 1.2))]
     return pack_rgb(*(np.rint(np.minimum(c, 1.0) * 255).astype(np.uint8) for c in channels))
+
+
+def _shade_table(up: np.ndarray) -> np.ndarray:
+    """(65 536,) uint32 shades by the top bytes of both components of a normal word, within three steps of 255."""
+    index = np.arange(1 << 16, dtype="<u4")
+    return shade(unpack_normals((index & 0xFF) << 8 | index >> 8 << 24 | 0x0080_0080), up)
+
+
+def _shade_words(words: np.ndarray, table: np.ndarray, bare: np.ndarray) -> np.ndarray:
+    """(n,) uint32 colour words of normal words, from a table of shades and the shade of a point without a normal."""
+    return np.where(words == NO_NORMAL, bare, table[words >> 8 & 0xFF | words >> 24 << 8])
 
 
 def parse_colour(text: str, key: str) -> np.ndarray:
@@ -200,8 +212,11 @@ def _scalars(scene: Scene, mode: str) -> Callable[[_Part], np.ndarray]:
 
 def _owner(first: np.ndarray, part: _Part) -> np.ndarray:
     """(n,) index of the range that holds each point, of ranges that start at ascending ``first``."""
-    index = np.arange(part.start, part.stop) if isinstance(part, slice) else part
-    return np.searchsorted(first, index, side="right") - 1
+    if isinstance(part, np.ndarray):
+        return np.searchsorted(first, part, side="right") - 1
+    a, b = np.searchsorted(first, [part.start, part.stop - 1], side="right")
+    bounds = np.concatenate([[part.start], first[a:b], [part.stop]])
+    return np.repeat(np.arange(a - 1, b), np.diff(bounds))
 
 
 def _by_chunk(n: int, words: Callable[[slice], np.ndarray]) -> np.ndarray:
