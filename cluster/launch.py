@@ -55,6 +55,15 @@ def record(**content: Any) -> None:
         sys.stdout.flush()
 
 
+def say_failed(message: str, status: int) -> None:
+    """Say in one line why this rank fails: to the launcher, which repeats the first, or to standard error."""
+    line = "splatpipe: " + " ".join(message.split())
+    if EXPECTED_RANKS in os.environ:
+        record(failed=status, why=line)
+    else:
+        print(line, file=sys.stderr, flush=True)
+
+
 def launch(arguments: Sequence[str], ranks: int, on_record: Callable[[dict[str, Any]], None]) -> int:
     """Run ``python -m splatpipe.cluster ARGUMENTS`` on ``ranks`` ranks; the exit status.
 
@@ -133,7 +142,7 @@ class _Relay:
         self._on_record = on_record
         self._ranks: dict[int, dict[str, Any]] = {}  # pid → announcement
         self._first_dead: int | None = None
-        self._error_said = False
+        self._failed: int | None = None  # exit status of the first rank that said why
         self._tail: deque[str] = deque(maxlen=40)
         self._selector = selectors.DefaultSelector()
 
@@ -154,11 +163,16 @@ class _Relay:
         status = self._process.wait()
         reader.join(5)
         self._selector.close()
-        if status != 0 and not self._error_said:
+        if status != 0 and self._failed is None:
             raise SplatpipeError(self._obituary(status))
-        return status if 0 <= status < 128 else 1
+        return self._failed or status
 
     def _take(self, content: dict[str, Any]) -> None:
+        if "failed" in content:
+            if self._failed is None:  # the others fail of the same cause, or because this one has gone
+                self._failed = content["failed"]
+                print(content["why"], file=sys.stderr, flush=True)
+            return
         if "pid" not in content:
             self._on_record(content)
             return
@@ -183,8 +197,6 @@ class _Relay:
         assert self._process.stderr is not None
         for line in self._process.stderr:
             self._tail.append(line)
-            if line.startswith("splatpipe: "):
-                self._error_said = True
             if not _NOISE.match(line.rstrip("\n")):
                 sys.stderr.write(line)
                 sys.stderr.flush()

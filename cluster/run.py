@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from ..shared.config import RunConfig, load_config
 from ..shared.errors import ConfigError, InputError, SplatpipeError
 from ..shared.files import write_json
 from .job import Job
-from .launch import EXPECTED_RANKS, inside_mpi, launch, mpi_available, record
+from .launch import EXPECTED_RANKS, inside_mpi, launch, mpi_available, record, say_failed
 from .plan import left_out
 from .progress import FrameProgress
 from .record import RECORD_VERSION, machine_record
@@ -96,7 +95,7 @@ def _run_rank(config_path: Path, overrides: list[str], json_path: Path | None) -
     except SplatpipeError as error:
         status = error.exit_status
         if transport.rank == 0:
-            print(f"splatpipe: {error}", file=sys.stderr, flush=True)
+            say_failed(str(error), status)
     status = transport.agree(status)
     if status or job is None:
         return status
@@ -129,9 +128,10 @@ def _abort(transport: Any, role: str, error: BaseException) -> None:
 
         traceback.print_exception(error)
     cause = str(error) if isinstance(error, SplatpipeError) else f"{type(error).__name__}: {error}"
-    print(f"splatpipe: rank {transport.rank} ({role}): {' '.join(cause.split())}", file=sys.stderr, flush=True)
+    status = getattr(error, "exit_status", 1)
+    say_failed(f"rank {transport.rank} ({role}): {cause}", status)
     time.sleep(0.2)  # so that the line is relayed before mpiexec tears everything down
-    transport.abort(getattr(error, "exit_status", 1))
+    transport.abort(status)
 
 
 def _finish(
