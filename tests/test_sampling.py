@@ -142,18 +142,36 @@ def test_ranges_beyond_an_entry_are_split_and_draw_the_same(scene, threshold, ma
     np.testing.assert_array_equal(expand(split.entries), expand(whole.entries))
 
 
-def test_a_far_view_draws_few_points_spread_over_the_whole_cloud():
-    positions = np.random.default_rng(7).uniform(size=(4000, 3))
+@pytest.fixture(scope="module")
+def far_camera():
+    """Sees the unit cube 15 pixels across, so that N ln N = 1215 points cover it."""
     pose = look_at([1000.0, 0.5, 0.5], [0.0, 0.5, 0.5], np.array([0.0, 0.0, 1.0]))
-    camera = perspective_camera(frame=0, world_from_camera=pose, fov_y_rad=0.02, width=300, height=300, near=0.1)
-    for order in ("layered", "depth-first"):
-        cloud = build_cloud(positions, positions, point_order=order, set_points=2000)
-        bits = CullingNode(cloud.octree, backface=False).process(camera)
-        picked = cloud.positions[expand(SamplingNode(cloud.octree, pixel_threshold=20).process(camera, bits).entries)]
-        assert 1000 <= len(picked) < 2400  # N ln N = 1215 for the 15 × 15 pixels of the root
-        octants = np.unique((picked > 0.5) @ [1, 2, 4], return_counts=True)[1]
-        assert len(octants) == 8
-        assert octants.min() > 0.6 * octants.mean()
+    return perspective_camera(frame=0, world_from_camera=pose, fov_y_rad=0.02, width=300, height=300, near=0.1)
+
+
+@pytest.mark.parametrize("order", ["layered", "depth-first"])
+def test_a_far_view_draws_few_points_spread_over_the_whole_cloud(far_camera, order):
+    positions = np.random.default_rng(7).uniform(size=(4000, 3))
+    cloud = build_cloud(positions, positions, point_order=order, set_points=2000)
+    bits = CullingNode(cloud.octree, backface=False).process(far_camera)
+    message = SamplingNode(cloud.octree, pixel_threshold=20).process(far_camera, bits)
+    picked = cloud.positions[expand(message.entries)]
+    assert 1000 <= len(picked) < 2400
+    octants = np.unique((picked > 0.5) @ [1, 2, 4], return_counts=True)[1]
+    assert len(octants) == 8
+    assert octants.min() > 0.6 * octants.mean()
+
+
+def test_a_strided_range_keeps_step_over_a_split(far_camera, monkeypatch):
+    positions = np.random.default_rng(7).uniform(size=(4000, 3))
+    cloud = build_cloud(positions, positions, point_order="depth-first")
+    bits = CullingNode(cloud.octree, backface=False).process(far_camera)
+    whole = SamplingNode(cloud.octree, pixel_threshold=20).process(far_camera, bits)
+    assert whole.entries.tolist() == [(0, 4000, 3)]
+    monkeypatch.setattr(sampling, "MAX_RANGE", 1000)
+    split = SamplingNode(cloud.octree, pixel_threshold=20).process(far_camera, bits)
+    assert len(split.entries) == 5
+    np.testing.assert_array_equal(expand(split.entries), expand(whole.entries))
 
 
 @pytest.fixture
