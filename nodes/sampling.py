@@ -4,10 +4,10 @@ The cut through the octree: a visible cell whose parent was expanded is drawn if
 on the screen, else it is expanded. Cells are visited in stored (breadth-first) order and the walk ends with
 the last child of an expanded cell, which is the end of the thesis's level-of-detail window.
 
-The projected size of a cell is its edge, in pixels, at the distance from the eye to the nearest point of its
-cube. That distance does not change when the camera only turns, never grows towards a parent, and is at most
-the distance of any point below; so is the size at least that of the edge anywhere in the cube, up to
-perspective stretch off axis.
+The projected size of a cell is its edge, in pixels, at the distance from the eye to the nearest point of its cube, or at
+the near plane if that is farther. (The thesis divides the diagonal by the distance of the centre, which is small for a
+cell the eye is in.) It does not change when the camera only turns, and at least halves from a cell to its child. That
+perspective stretches lengths off the view axis is not counted.
 """
 
 from __future__ import annotations
