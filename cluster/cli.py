@@ -13,6 +13,7 @@ from typing import Annotated, Any
 
 import typer
 
+from ..shared.compile_cache import ensure_compile_cache
 from ..shared.errors import InputError, SplatpipeError
 
 app = typer.Typer(
@@ -196,6 +197,7 @@ def _report(results: dict[str, Any], show: Any, json: Path | None) -> None:
 
 def main() -> None:
     """Entry point of ``splatpipe``: one line and an exit status for whatever goes wrong."""
+    ensure_compile_cache()
     try:
         app()
     except SplatpipeError as error:

@@ -12,6 +12,7 @@ import numpy as np
 from ..nodes.culling import CullingNode
 from ..nodes.raster import PointSize
 from ..nodes.raster.choose import make_rasterizer
+from ..nodes.raster.cpu import kernels_cached
 from ..nodes.render import RenderNode, load_points
 from ..nodes.sampling import SamplingNode
 from ..shared.camera import Camera
@@ -73,7 +74,8 @@ class Job:
                 )
             )
             node = RenderNode(rasterizer)
-            progress("compiling kernels (once; kept for the next run)", 0)
+            if rasterizer.name == "cpu" and not kernels_cached():
+                progress("compiling kernels (once; kept for the next run)", 0)
             node.warm_up(self.camera(0))
             sink = None
             if output.png or output.mp4:

@@ -3,14 +3,13 @@
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from splatpipe.nodes.raster import PointSize, ResidentPoints, pixel_from_blocks
-from splatpipe.nodes.raster.cpu import CpuRasterizer, kernels_cached, warm_up
+from splatpipe.nodes.raster.cpu import CpuRasterizer
 from splatpipe.nodes.raster.reference import point_indices, project, project_float32, reference_frame
 from splatpipe.shared.camera import look_at, perspective_camera
 from splatpipe.shared.errors import InputError, MessageError
@@ -283,6 +282,12 @@ def test_wrong_viewport_and_sizes_are_refused():
         CpuRasterizer(points, 3, 3, threads=0)
 
 
+@pytest.mark.parametrize("size", [(0,), (1, 0.0, 0), (1, -1.0), (1, np.nan), (1, np.inf), (40_000,)])
+def test_impossible_point_sizes_are_refused(size):
+    with pytest.raises(InputError, match="point size: found"):
+        PointSize(*size)
+
+
 def test_indices_of_entries():
     entries = render_points((4, 0, 1), (2, 7, 3), (0, 2, 1), (9, 1, 100))
     assert point_indices(entries).tolist() == [2, 5, 8, 0, 1, 9]
@@ -306,29 +311,37 @@ def run_python(code, **environment):
 
 def test_kernels_are_compiled_once_also_by_processes_that_start_together(tmp_path):
     code = (
-        "from splatpipe.nodes.raster.cpu import kernels_cached, warm_up\n"
-        "from splatpipe.nodes.raster import kernels\n"
-        "before = kernels_cached(); warm_up()\n"
+        "import numpy as np\n"
+        "from splatpipe.nodes.raster import ResidentPoints, kernels\n"
+        "from splatpipe.nodes.raster.cpu import CpuRasterizer, kernels_cached\n"
+        "from splatpipe.shared.camera import Camera\n"
+        "from splatpipe.shared.messages import RENDER_POINT\n"
+        "one = np.ones(1, np.float32)\n"
+        "points = ResidentPoints(one, one, one, np.ones(1, np.uint32), np.zeros(1, np.int64), np.zeros((1, 3)))\n"
+        "before = kernels_cached()\n"
+        "with CpuRasterizer(points, 1, 1) as rasterizer:\n"
+        "    rasterizer.draw(Camera(0, np.eye(4), np.zeros(3), 1, 1, 0.1), np.empty(0, RENDER_POINT))\n"
         "print(before, kernels_cached(), sum(kernels.draw.stats.cache_hits.values()))"
     )
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
-    both = [
-        subprocess.Popen([sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True)
-        for _ in range(2)
-    ]
-    for process in both:
+
+    def start():
+        return subprocess.Popen([sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True)
+
+    for process in [start(), start()]:
         out, _ = process.communicate(timeout=100)
         assert process.returncode == 0
         assert out.split()[1] == "True"
-    assert run_python(code, NUMBA_CACHE_DIR=str(tmp_path)).split() == ["True", "True", "1"]
-    assert list(Path(tmp_path).rglob("kernels.draw-*.nbi"))
+    assert start().communicate(timeout=100)[0].split() == ["True", "True", "1"]
 
 
-def test_warm_up_loads_what_drawing_needs():
+def test_drawing_nothing_compiles_all_that_drawing_needs():
     from splatpipe.nodes.raster import kernels, pieces
 
-    warm_up()
-    assert kernels_cached()
+    for size in SIZES:
+        for threads in (1, 2):
+            draw(cloud(5000), camera(61, 53), render_points(), size, threads)
+    before = [list(kernel.signatures) for kernel in (kernels.draw, kernels.merge, pieces._split)]
     draw(cloud(5000), camera(61, 53), render_points((0, 5000, 1), (1, 4000, 7)), PointSize(3), threads=2)
-    for kernel in (kernels.draw, kernels.merge, pieces._split):
-        assert len(kernel.signatures) == 1
+    assert [kernel.signatures for kernel in (kernels.draw, kernels.merge, pieces._split)] == before
+    assert [len(signatures) for signatures in before] == [1, 1, 1]

@@ -94,8 +94,8 @@ def print_raster(results: dict[str, Any], console: Any) -> None:
     from rich.table import Table
 
     table = Table(title=f"{results['n_points']:,} points, {results['size_px']}² pixels, frame read back")
-    table.add_column("rasterizer")
-    table.add_column("order")
+    table.add_column("rasterizer", no_wrap=True)
+    table.add_column("order", no_wrap=True)
     for heading in ("ms median", "min", "max", "frames", "M points/s", "× VTK", "of read limit", "pixels differing"):
         table.add_column(heading, justify="right")
     for row in results["rows"]:
@@ -122,7 +122,7 @@ def print_raster(results: dict[str, Any], console: Any) -> None:
         f"read limit: {limit['ms']['median']:.2f} ms for {limit['bytes_per_point']} bytes a point "
         f"with {limit['threads']} threads ({read_bytes / limit['ms']['median'] / 1e6:.1f} GB/s)"
     )
-    console.print(f"{machine['cpu']}, {machine['cores']} cores, commit {machine['commit']}")
+    console.print(f"{machine['cpu']}, {machine['cores']} cores, commit {machine['commit'] or 'unknown'}")
 
 
 def _measure(draw: Draw, expected: np.ndarray, repeats: int) -> dict[str, Any]:

@@ -6,12 +6,17 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
 from ...shared.camera import Camera
+from ...shared.errors import InputError
+
+MAX_SIDE_PX = 1 << 15
+"""Largest side of a point's square, and of the viewport of ``cpu``: pixel indices stay within int32."""
 
 
 @dataclass(frozen=True)
@@ -42,13 +47,25 @@ class PointSize:
 
     pixels : fixed side ≥ 1; used alone when ``world`` is 0.
     world : side in world units, > 0 for attenuation with distance: side = clamp(world · focal_px / depth, pixels,
-        maximum).
-    maximum : largest side in pixels.
+        maximum), rounded to the nearest integer.
+    maximum : largest side in pixels when attenuated; ``pixels`` if that is larger.
+
+    A point at (u, v) covers the columns floor(u − (side − 1) / 2) … + side − 1, and rows likewise: the pixels whose
+    centres lie within half a side of it. The part inside the image is drawn, at the depth of the point.
+    Raises InputError for a side out of 1…``MAX_SIDE_PX`` or a ``world`` that is negative or not finite.
     """
 
     pixels: int = 1
     world: float = 0.0
     maximum: int = 64
+
+    def __post_init__(self) -> None:
+        if not (1 <= self.pixels <= MAX_SIDE_PX and 1 <= self.maximum <= MAX_SIDE_PX):
+            raise InputError(
+                f"point size: found {self.pixels} px, at most {self.maximum} px, expected 1…{MAX_SIDE_PX} px"
+            )
+        if not 0 <= self.world < math.inf:
+            raise InputError(f"point size: found {self.world} world units, expected a finite number ≥ 0")
 
 
 class Rasterizer(Protocol):

@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from ...shared.camera import Camera, look_at, perspective_camera
+from ...shared.camera import Camera
 from ...shared.errors import InputError, MessageError
-from ...shared.messages import FRAMEBUFFER_EMPTY, RENDER_POINT
-from . import PointSize, ResidentPoints, pixel_from_blocks
+from ...shared.messages import FRAMEBUFFER_EMPTY
+from . import MAX_SIDE_PX, PointSize, ResidentPoints, pixel_from_blocks
 from .pieces import split_entries
 
 PIECE_POINTS = 1 << 14
@@ -31,9 +31,6 @@ TURNS_PER_THREAD = 32
 POINTS_PER_MERGED_PIXEL = 2.5
 """Time to merge one pixel of one framebuffer ≈ this many times less than to draw one point (measured)."""
 
-MAX_SIDE_PX = 1 << 15
-"""Largest width and height: pixel indices stay within int32."""
-
 
 class CpuRasterizer:
     """Draws a resident point-array on the CPU; a context manager that owns its threads and framebuffers.
@@ -41,7 +38,7 @@ class CpuRasterizer:
     points : the render rank's half of a scene. Not modified, not copied if its arrays have the documented dtypes.
     width, height : viewport, 1…32768 px.
     threads : at most this many; None: all cores this process may run on.
-    Raises InputError if the viewport, the point size or the number of threads is out of range.
+    Raises InputError if the viewport or the number of threads is out of range.
     Memory: width · height · 8 bytes for the frame, as much again for each thread that a frame is worth.
     """
 
@@ -150,7 +147,7 @@ def _read_only(column: np.ndarray) -> np.ndarray:
 
 
 def kernels_cached() -> bool:
-    """Whether ``warm_up`` will load the kernels instead of compiling them (some seconds).
+    """Whether the first frame will load the kernels instead of compiling them (some seconds).
 
     True if the compiled files are younger than the source, as far as numba's cache folder tells.
     """
@@ -162,13 +159,3 @@ def kernels_cached() -> bool:
         return any(file.stat().st_mtime > source.stat().st_mtime for file in index)
 
     return all(map(cached, (kernels.draw, kernels.merge, pieces._split)))
-
-
-def warm_up() -> None:
-    """Compile the kernels, or load them from numba's cache, by drawing one point."""
-    one = np.zeros(1, np.float32)
-    points = ResidentPoints(one, one, one, np.zeros(1, np.uint32), np.zeros(1, np.int64), np.zeros((1, 3)))
-    pose = look_at(np.ones(3), np.zeros(3), np.array([0.0, 0.0, 1.0]))
-    camera = perspective_camera(frame=0, world_from_camera=pose, fov_y_rad=1.0, width=1, height=1, near=0.1)
-    with CpuRasterizer(points, 1, 1, threads=1) as rasterizer:
-        rasterizer.draw(camera, np.array([(0, 1, 1)], RENDER_POINT))
