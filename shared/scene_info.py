@@ -57,7 +57,8 @@ class SceneInfo:
     origin, edge : the root cube.  lower, upper : tight bounds of the input points; world frame.
     n_points : input points.  n_stored : points in the point-array, level-of-detail copies included.
     n_dropped : input points left out because a coordinate was not finite.
-    block_levels : a block of cells is the subtree of the ancestor this many levels above a cell.
+    block_levels : in layered order, the points of a cell are relative to the centre of its ancestor this many levels
+        above; 0 in depth-first order, where blocks are cells of up to 2048 points or leaves.
     up : the axis that points up, one of ``UP_AXES``.  crs : well-known text, or None.
     build : the settings the scene was built with.
     """

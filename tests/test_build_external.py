@@ -45,16 +45,16 @@ def build(tmp, source, plan, monkeypatch, **options):
 @pytest.mark.parametrize("flatness", [0.0, 1e-3])
 def test_scene_does_not_depend_on_memory(tmp_path, monkeypatch, kind, point_order, flatness):
     rng = np.random.default_rng(7)
-    positions = clouds(kind, 3000, rng)
+    positions = clouds(kind, 7000, rng)
     columns = columns_for(len(positions), ("rgb", "gps_time")) | {
-        "normal": pack_normals(rng.normal(size=(3000, 3)) + 2)
+        "normal": pack_normals(rng.normal(size=(7000, 3)) + 2)
     }
     source = ArraySource(positions, columns)
     options = {"point_order": point_order, "flatness": flatness, "points_per_cell": 32}
     report, whole = build(tmp_path, source, MemoryPlan(10_000, 900), monkeypatch, **options)
     assert report.n_partitions == 1
     assert report.spilled_bytes == 0
-    for capacity in (1100, 300):
+    for capacity in (5000, 2100):
         report, parts = build(tmp_path, source, MemoryPlan(capacity, 500), monkeypatch, **options)
         assert report.spilled_bytes > 0
         assert parts == whole

@@ -9,7 +9,7 @@ from ..scene_info import CELL_ARRAYS
 from .cones import merge_cones
 from .parallel import Workers
 from .partition import Cells
-from .point_array import PointArrayWriter
+from .point_array import PointArrayWriter, block_level
 from .sets import sample_inner, set_sizes
 from .subtree import LinkedCells, link
 
@@ -104,7 +104,8 @@ class Assembly:
         sample_inner(tree, self._capacity, stored, workers)
         top.n_points = owned
         top.first_point = array.n_stored + np.cumsum(owned) - owned
-        array.append(pool, stored[len(pool) :], top.level, top.code, owned, workers)
+        blocks = block_level(top, "layered", self._capacity)
+        array.append(pool, stored[len(pool) :], top.level, top.code, owned, blocks, workers)
 
     def _span_top(self, top: LinkedCells) -> None:
         tree, inner, roots = self._with_roots(top)

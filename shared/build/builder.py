@@ -18,7 +18,7 @@ from .ingest import Bounds, Columns, Tally, common_attributes, declared_bounds, 
 from .morton import keys_of, root_cube
 from .parallel import Workers
 from .partition import Subdivision
-from .point_array import PointArrayWriter, block_levels_of
+from .point_array import PointArrayWriter, block_level, block_levels_of
 from .runs import Partition, Runs
 from .settings import BuildReport, BuildSettings, MemoryPlan, plan_memory
 from .streamed import append_streamed_leaf
@@ -73,9 +73,7 @@ class _Build:
             with self.timed("read"):
                 held, runs, tally = self.read_all()
                 origin, edge = root_cube(*root_bounds(self.declared, tally))
-            self.array = PointArrayWriter(
-                self.writer, self.attributes, origin, edge, block_levels_of(self.settings.points_per_cell)
-            )
+            self.array = PointArrayWriter(self.writer, self.attributes, origin, edge)
             self.assembly = Assembly(self.settings.point_order, self.settings.points_per_cell)
             if runs is None:
                 self.add_partition(held, keys_of(held.positions, origin, edge, self.workers), 0, 0, tally.n_points)
@@ -158,7 +156,7 @@ class _Build:
             return
         with self.timed("write"):
             cells, root_set = append_streamed_leaf(
-                partition, runs, self.memory.capacity, self.settings.points_per_cell, self.array, self.workers
+                partition, runs, self.memory.capacity, self.settings, self.array, self.workers
             )
             self.assembly.add(cells, root_set)
 
@@ -178,6 +176,7 @@ class _Build:
                 cells.level[owners],
                 cells.code[owners],
                 cells.n_points[owners],
+                block_level(cells, order, self.settings.points_per_cell)[owners],
                 self.workers,
                 lambda n_stored: self.progress("write", done + int(n_stored * share), n_total),
             )
@@ -200,7 +199,7 @@ class _Build:
             n_blocks=len(first),
             n_dropped=tally.n_dropped,
             attributes=self.attributes,
-            block_levels=block_levels_of(self.settings.points_per_cell),
+            block_levels=block_levels_of(self.settings.point_order, self.settings.points_per_cell),
             up=self.settings.up,
             crs=next((s.info.crs for s in self.sources if s.info.crs), None),
             sources=tuple(

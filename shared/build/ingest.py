@@ -43,6 +43,11 @@ class Tally:
         return sum(self.source_points)
 
 
+_BATCH_POINTS = 1 << 16
+"""Asked of a reader at a time: few enough that a batch is copied on while it lies in the cache."""
+_COMPRESSED_BATCH_POINTS = 1 << 18
+"""The same of LAZ, whose chunks of 50 000 points are decompressed side by side."""
+
 Bounds = tuple[np.ndarray, np.ndarray]
 _BOUNDS_TOLERANCE = 2.0**-10
 
@@ -68,8 +73,9 @@ def root_bounds(declared: Bounds | None, tally: Tally) -> Bounds:
     if declared is None:
         return tight
     rounding = 4 * np.spacing(np.max(np.abs(tight)))
-    tolerance = _BOUNDS_TOLERANCE * np.max(tally.upper - tally.lower)
-    wider = np.array([tally.lower - declared[0], declared[1] - tally.upper])
+    with np.errstate(over="ignore"):  # an extent beyond float64 is refused by ``root_cube``
+        tolerance = _BOUNDS_TOLERANCE * np.max(tally.upper - tally.lower)
+        wider = np.array([tally.lower - declared[0], declared[1] - tally.upper])
     return declared if ((wider >= -rounding) & (wider <= tolerance)).all() else tight
 
 
@@ -83,7 +89,8 @@ def finite_batches(
     with ThreadPoolExecutor(1) as ahead:
         for source in sources:
             tally.source_points.append(0)
-            stream = source.batches(max_points, attributes)
+            few = _COMPRESSED_BATCH_POINTS if source.info.format in ("laz", "copc") else _BATCH_POINTS
+            stream = source.batches(min(max_points, few), attributes)
             coming = ahead.submit(next, stream, None)
             while (batch := coming.result()) is not None:
                 coming = ahead.submit(next, stream, None)

@@ -27,7 +27,8 @@ def root_cube(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, float]:
     translation are exact too, and float32 offsets from them do not change.
     Raises InputError if an extent is not finite in float64.
     """
-    extent = float(np.max(upper - lower))
+    with np.errstate(over="ignore"):
+        extent = float(np.max(upper - lower))
     if not math.isfinite(extent):
         raise InputError(f"bounds: found an extent of {extent}, expected a finite one")
     largest = float(np.max(np.abs([lower, upper])))

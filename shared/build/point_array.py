@@ -10,22 +10,41 @@ from numba import njit
 from ..octree import cell_centers
 from ..points import ATTRIBUTES, PointBatch
 from .parallel import Workers
+from .subtree import LinkedCells
 from .writer import SceneWriter, writing
 
 _CHUNK = 1 << 18
-_MEAN_BLOCK_POINTS = 1024
+_LAYERED_BLOCK_POINTS = 1024
+_DEPTH_FIRST_BLOCK_POINTS = 2048
 
 
-def block_levels_of(points_per_cell: int) -> int:
-    """How many levels above a cell its block stands: blocks of a surface hold about 1024 points or more.
+def block_levels_of(point_order: str, points_per_cell: int) -> int:
+    """How many levels above a cell its block stands in layered order, so that a block holds 1024 points or more.
 
-    Decided by the settings alone, so that the first partition can be written before the last one is read. Cells of a
-    surface hold half of ``points_per_cell`` points in the middle, and four times as many a level up.
+    Decided by the settings alone, so that the first partition can be written before the last one is read: cells of a
+    surface hold about half of ``points_per_cell`` points, and four times as many a level up. 0 in depth-first order.
     """
     levels = 0
-    while points_per_cell / 2 * 4**levels < _MEAN_BLOCK_POINTS:
+    while point_order == "layered" and points_per_cell / 2 * 4**levels < _LAYERED_BLOCK_POINTS:
         levels += 1
     return levels
+
+
+def block_level(cells: LinkedCells, point_order: str, points_per_cell: int) -> np.ndarray:
+    """(n,) int64: the level of the ancestor or self of each cell whose centre its points are stored relative to.
+
+    Layered: ``block_levels_of`` above the cell. Depth-first, where leaves of several levels alternate: the highest
+    ancestor with at most 2048 points below, or ``points_per_cell`` if that is more; so blocks are never interrupted.
+    """
+    level = cells.level.astype(np.int64)
+    if point_order == "layered":
+        return np.maximum(level - block_levels_of(point_order, points_per_cell), 0)
+    inside = cells.count <= max(points_per_cell, _DEPTH_FIRST_BLOCK_POINTS)
+    for at in np.unique(level)[1:]:
+        here = np.flatnonzero(level == at)
+        parent = cells.parent[here]
+        level[here[inside[parent]]] = level[parent[inside[parent]]]
+    return level
 
 
 @njit(nogil=True, cache=True)
@@ -52,13 +71,11 @@ class PointArrayWriter:
     Each file is one task: it gathers, writes and sums up its own bytes in order, side by side with the others.
     """
 
-    def __init__(
-        self, writer: SceneWriter, attributes: tuple[str, ...], origin: np.ndarray, edge: float, block_levels: int
-    ) -> None:
+    def __init__(self, writer: SceneWriter, attributes: tuple[str, ...], origin: np.ndarray, edge: float) -> None:
         self.n_stored = 0
         self.attributes = attributes
         self._writer = writer
-        self._origin, self._edge, self._levels = origin, edge, block_levels
+        self._origin, self._edge = origin, edge
         self._xyz = [writer.open_column(name, np.dtype("<f4")) for name in "xyz"]
         self._columns = {a: writer.open_column(f"attr_{a}", ATTRIBUTES[a]) for a in attributes}
         self._block_first: list[np.ndarray] = []
@@ -72,27 +89,28 @@ class PointArrayWriter:
         level: np.ndarray,
         code: np.ndarray,
         n_points: np.ndarray,
+        block_level: np.ndarray,
         workers: Workers,
         advance: Callable[[int], None] | None = None,
     ) -> None:
         """Append ``points`` picked by ``stored``.
 
         stored : (m,) uint32 indices of points.
-        level, code, n_points : the cells that own them, one after another, n_points sums up to m.
+        level, code, n_points, block_level : the cells that own them, one after another; n_points sums up to m.
         advance : called with the points written of these.
         """
-        first, origin = self._open_blocks(level, code, n_points)
+        first, origin = self._open_blocks(level, code, n_points, block_level)
         with writing(self._writer.partial):
             tasks = [(self._append_positions, points.positions, stored, first, origin, advance)]
             tasks += [(self._append_column, name, column, stored) for name, column in points.attributes.items()]
             workers.map(lambda task, *arguments: task(*arguments), tasks)
         self.n_stored += len(stored)
 
-    def _open_blocks(self, level: np.ndarray, code: np.ndarray, n_points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _open_blocks(
+        self, level: np.ndarray, code: np.ndarray, n_points: np.ndarray, block_level: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """First point within these points, and origin, of the runs of cells with one block; noted for the table."""
-        level, code = level.astype(np.int64), code.astype(np.int64)
-        block_level = np.maximum(level - self._levels, 0)
-        block_code = code >> 3 * (level - block_level)
+        block_code = code >> 3 * (level.astype(np.int64) - block_level)
         starts = np.flatnonzero(np.r_[True, (np.diff(block_level) != 0) | (np.diff(block_code) != 0)])
         first = (np.cumsum(n_points) - n_points)[starts]
         origin = cell_centers(self._origin, self._edge, block_level[starts], block_code[starts].astype(np.uint64))

@@ -139,7 +139,7 @@ _SORT_BYTES = 8 + 4 + 4 + 10
 _READER_BYTES = 320
 """A point in a reader: file bytes, decoded columns and temporaries, one batch ahead."""
 _MIN_CAPACITY = 1 << 16
-_MAX_BATCH = 1 << 19
+_MAX_BATCH = 1 << 18
 
 
 def plan_memory(settings: BuildSettings, attributes: tuple[str, ...]) -> MemoryPlan:

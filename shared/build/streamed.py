@@ -9,9 +9,10 @@ from ..points import PointBatch
 from .cones import add_normals, start_cone, widen_cone
 from .ingest import Columns
 from .parallel import Workers
-from .point_array import PointArrayWriter
+from .point_array import PointArrayWriter, block_level
 from .runs import Partition, Runs
 from .sets import permutation, place
+from .settings import BuildSettings
 from .subtree import LinkedCells
 
 
@@ -30,19 +31,30 @@ def append_streamed_leaf(
     leaf: Partition,
     runs: Runs,
     capacity: int,
-    set_size: int,
+    settings: BuildSettings,
     array: PointArrayWriter,
     workers: Workers,
 ) -> tuple[LinkedCells, PointBatch]:
-    """Append the points of an oversize leaf in the order of its permutation: (its cell, its first ``set_size`` points).
+    """Append the points of an oversize leaf in the order of its permutation: (its cell, the first points of its set).
 
     Cost: one pass over the leaf's points for every ``capacity`` points, and one more where there are normals.
     """
     n = leaf.n_points
     p = np.empty(6, np.uint64)
     permutation(leaf.level, leaf.code, n, p)
-    first_point = array.n_stored
-    level, code = np.array([leaf.level], np.uint8), np.array([leaf.code], np.int64)
+    one = np.zeros(1, np.int64)
+    cell = LinkedCells(
+        level=np.array([leaf.level], np.uint8),
+        code=one + leaf.code,
+        parent=one - 1,
+        first_child=one - 1,
+        n_children=one,
+        count=one + n,
+        start=one,
+        first_point=one + array.n_stored,
+        n_points=one + n,
+    )
+    blocks = block_level(cell, settings.point_order, settings.points_per_cell)
     total, cone = np.zeros(3), np.zeros(4)
     first_set, complete = None, True
     for begin in range(0, n, capacity):
@@ -58,27 +70,14 @@ def append_streamed_leaf(
                 column[target] = batch.attributes[name][source]
             read += len(batch)
         in_order = np.arange(end - begin, dtype=np.uint32)
-        array.append(window, in_order, level, code, np.array([end - begin]), workers)
+        array.append(window, in_order, cell.level, cell.code, np.array([end - begin]), blocks, workers)
         if first_set is None:
-            first_set = window.select(np.arange(min(set_size, end - begin)))
+            first_set = window.select(np.arange(min(settings.points_per_cell, end - begin)))
         if "normal" in window.attributes and complete:
             complete = add_normals(window.attributes["normal"], in_order, 0, end - begin, total)
     assert first_set is not None
     if "normal" in array.attributes and start_cone(total if complete else np.zeros(3), cone):
         for batch in runs.stream(leaf.level, leaf.code):
             widen_cone(batch.attributes["normal"], np.arange(len(batch), dtype=np.uint32), 0, len(batch), cone)
-    one = np.zeros(1, np.int64)
-    cells = LinkedCells(
-        level=level,
-        code=code,
-        parent=one - 1,
-        first_child=one - 1,
-        n_children=one,
-        count=one + n,
-        start=one,
-        first_point=one + first_point,
-        n_points=one + n,
-        normal_sum=(total if complete else np.zeros(3))[None],
-        cone=cone[None],
-    )
-    return cells, first_set
+    cell.normal_sum, cell.cone = (total if complete else np.zeros(3))[None], cone[None]
+    return cell, first_set
