@@ -122,8 +122,7 @@ def _cull(centers, level, parent, half_edge, cone, eye, planes, undecided):
 
 @njit(nogil=True, cache=True)
 def _facing(cone, x, y, z, half):
-    """−1: every normal of the cone faces away from the eye, wherever in the cube; 1: every one towards; 0:
-    mixed.
+    """−1: every normal of the cone faces away from the eye, wherever in the cube; 1: every one towards; 0: mixed.
 
     (x, y, z) is the cube's centre seen from the eye. With the cone's half angle α and the angular radius β of
     the cube's bounding sphere, "away" is angle(axis, centre) + α + β ≤ 90°, without an inverse cosine.

@@ -4,10 +4,10 @@ The cut through the octree: a visible cell whose parent was expanded is drawn if
 on the screen, else it is expanded. Cells are visited in stored (breadth-first) order and the walk ends with
 the last child of an expanded cell, which is the end of the thesis's level-of-detail window.
 
-The projected size of a cell is its edge, in pixels, at the distance from the eye to the nearest point of its cube, or at
-the near plane if that is farther. (The thesis divides the diagonal by the distance of the centre, which is small for a
-cell the eye is in.) It does not change when the camera only turns, and at least halves from a cell to its child. That
-perspective stretches lengths off the view axis is not counted.
+The projected size of a cell is its edge, in pixels, at the distance from the eye to the nearest point of its cube, or
+at the near plane if that is farther. (The thesis divides the diagonal by the distance of the centre, which underrates
+a large cell that the eye is in or close to.) It does not change when the camera only turns, and at least halves from
+a cell to its child. Stretch off the view axis is not counted.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ class SamplingNode:
 @njit(nogil=True, cache=True)
 def points_needed(n_pixels):
     """max(1, ⌊N ln N⌋) as float64: points that, picked at random, cover N pixels (thesis 4.3.2)."""
-    return max(1.0, math.floor(n_pixels * math.log(n_pixels))) if n_pixels > 1.0 else 1.0
+    return max(1.0, np.floor(n_pixels * np.log(n_pixels))) if n_pixels > 1.0 else 1.0
 
 
 @njit(nogil=True, cache=True)

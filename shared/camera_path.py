@@ -130,7 +130,8 @@ class OrbitPath:
 
     center : (3,) float64, world.  radius : distance of the eye, world units.  up : (3,) float64, a unit axis.
     elevation_rad : height above the horizon, in [−π/2, π/2].  start_rad, sweep_rad : azimuth at time 0 and how far it
-    turns, counter-clockwise seen from above.
+    turns, counter-clockwise seen from above. At azimuth 0, x points to the right of the image (y where x is up): a map
+    is seen from the south, a model with y up from its front.
     """
 
     center: np.ndarray
@@ -154,11 +155,11 @@ class OrbitPath:
     def pose(self, time: float) -> np.ndarray:
         """(4, 4) float64 world_from_camera."""
         azimuth = self.start_rad + time * self.sweep_rad
-        first = np.roll(np.abs(self.up), 1)  # x where z is up
-        second = np.cross(self.up, first)
-        outwards = math.cos(azimuth) * first + math.sin(azimuth) * second
+        rightwards = axis_vector("y" if self.up[0] else "x")
+        front = np.cross(rightwards, self.up)
+        outwards = math.cos(azimuth) * front + math.sin(azimuth) * rightwards
         back = math.cos(self.elevation_rad) * outwards + math.sin(self.elevation_rad) * self.up
-        right = math.cos(azimuth) * second - math.sin(azimuth) * first
+        right = math.cos(azimuth) * rightwards - math.sin(azimuth) * front
         return _rigid(np.column_stack([right, np.cross(back, right), back]), self.center + self.radius * back)
 
 

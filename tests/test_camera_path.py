@@ -90,7 +90,7 @@ def test_the_orbit_radius_is_the_least():
         at, _ = image_positions(camera, corners(lower, upper))
         reach.append(np.abs(at / [1500, 1000] - 0.5).max())
     assert max(reach) == pytest.approx(0.5, abs=1e-3)
-    assert np.allclose(camera.eye - center, radius * np.array([math.cos(0.4), 0, math.sin(0.4)]), atol=1e-2)
+    assert np.allclose(camera.eye - center, radius * np.array([0, -math.cos(0.4), math.sin(0.4)]), atol=1e-2)
 
 
 @pytest.mark.parametrize("up", AXES)
@@ -105,6 +105,12 @@ def test_up_is_up_in_the_image_and_the_orbit_turns_counter_clockwise(up):
         assert at[1, 1] < at[0, 1] - 10
         turned = np.cross(camera.eye - center, path.camera(frame + 1).eye - center)
         assert turned @ axis > 0
+
+
+@pytest.mark.parametrize(("up", "offset"), [("z", [0, -7, 0]), ("y", [0, 0, 7]), ("x", [0, 0, -7])])
+def test_a_film_starts_with_a_map_seen_from_the_south_and_a_model_from_its_front(up, offset):
+    section = CameraSection(up=up, elevation_deg=0, radius=7.0, center=(0, 0, 0))
+    np.testing.assert_allclose(camera_path(section, scene(), 4).camera(0).eye, offset, atol=1e-12)
 
 
 @pytest.mark.parametrize("elevation", [-90.0, 90.0])

@@ -2,6 +2,7 @@
 points."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -186,6 +187,14 @@ def small():
 def test_a_threshold_out_of_range_is_refused(small, threshold):
     with pytest.raises(ConfigError, match="pixel_threshold"):
         SamplingNode(small[0], pixel_threshold=threshold)
+
+
+def test_more_pixels_than_an_integer_holds(small):
+    octree, camera = small
+    bits = CullingNode(octree, backface=False).process(camera)
+    inside = replace(camera, eye=octree.centers[0], near=1e-12)
+    message = SamplingNode(octree, pixel_threshold=1e300).process(inside, bits)
+    assert message.n_points == sum(cut_twin(octree, inside, bits.unpack(), 1e150).values()) == 50
 
 
 def test_bits_of_another_frame_or_octree_are_refused(small):
