@@ -114,7 +114,7 @@ class ColourRange:
             return channel
         if channel.dtype == np.uint16 and self.factor < 1:
             return (channel >> 8).astype(np.uint8)
-        if self.factor <= 1:
+        if self.factor < 1:
             return to_uint8(channel * self.factor)
         return to_uint8(np.rint(channel * self.factor))
 

@@ -84,9 +84,10 @@ class LasSource(Source):
         """Write the columns of (n,) records into rows ``first`` … of ``batch``."""
         rows = slice(first, first + len(records))
         positions = batch.positions[rows]
-        for axis, name in enumerate("XYZ"):
-            np.multiply(records[name], self._header.scales[axis], out=positions[:, axis])
-        positions += self._header.offsets
+        with np.errstate(over="ignore", invalid="ignore"):  # a damaged scale; non-finite points are passed on
+            for axis, name in enumerate("XYZ"):
+                np.multiply(records[name], self._header.scales[axis], out=positions[:, axis])
+            positions += self._header.offsets
         for attribute, column in batch.attributes.items():
             match attribute:
                 case "rgb":

@@ -112,10 +112,11 @@ def _check_chunks(path: Path, file: BinaryIO, header: Any, record: bytes) -> int
         )
     if _compressor(record) == _LAYERED:
         at = start + 8
-        for _, n_bytes in chunks:
-            file.seek(at + item_bytes)
-            sizes = np.frombuffer(file.read(4 * (1 + _layer_count(record))), "<u4")[1:]
-            if int(sizes.sum(dtype=np.uint64)) > n_bytes:
+        head = struct.Struct(f"<{item_bytes}xI{_layer_count(record)}I")  # first record, points, bytes of each layer
+        for n, n_bytes in chunks:
+            file.seek(at)
+            counts = head.unpack(file.read(head.size).ljust(head.size, b"\xff"))
+            if counts[0] > n or head.size + sum(counts[1:]) != n_bytes:
                 raise damaged
             at += n_bytes
     return max((n for n, _ in chunks), default=0)
