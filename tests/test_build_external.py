@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import shutil
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from splatpipe.shared.build import BuildSettings, build_scene, builder
 from splatpipe.shared.build.settings import MemoryPlan
+from splatpipe.shared.errors import InputError
 from splatpipe.shared.points import pack_normals
 from splatpipe.shared.store import Scene
 
@@ -58,3 +63,84 @@ def test_scene_does_not_depend_on_memory(tmp_path, monkeypatch, kind, point_orde
         report, parts = build(tmp_path, source, MemoryPlan(capacity, 500), monkeypatch, **options)
         assert report.spilled_bytes > 0
         assert parts == whole
+
+
+class CountingSource(ArraySource):
+    """Says how often it was read, and with which attributes."""
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.passes = []
+
+    def _read(self, max_points, attributes):
+        self.passes.append(attributes)
+        return super()._read(max_points, attributes)
+
+
+@pytest.mark.parametrize(
+    ("bounds", "passes"),
+    [
+        ("true", [("rgb",)]),
+        (None, [("rgb",), ()]),  # a second pass, over the positions, when the memory is full
+        (([-1.0] * 3, [0.5] * 3), [("rgb",), ("rgb",)]),  # points outside: once more with the bounds found
+        (([-1e9] * 3, [1e9] * 3), [("rgb",), ("rgb",)]),  # far too wide
+    ],
+)
+def test_input_is_read_once_unless_its_bounds_are_missing_or_wrong(tmp_path, monkeypatch, bounds, passes):
+    positions = np.random.default_rng(0).uniform(-1, 1, (5000, 3))
+    if bounds not in ("true", None):
+        bounds = tuple(np.array(b) for b in bounds)
+    source = CountingSource(positions, columns_for(5000), bounds=bounds)
+    _, whole = build(tmp_path, source, MemoryPlan(10_000, 900), monkeypatch, points_per_cell=50)
+    assert source.passes == [("rgb",)]
+    source.passes.clear()
+    report, parts = build(tmp_path, source, MemoryPlan(2100, 900), monkeypatch, points_per_cell=50)
+    assert source.passes == passes
+    assert report.n_partitions > 1
+    assert parts == whole
+
+
+@pytest.mark.parametrize("n_points", [None, 3000])
+def test_count_of_the_header_is_not_needed(tmp_path, monkeypatch, n_points):
+    positions = np.random.default_rng(0).uniform(-1, 1, (3000, 3))
+    source = ArraySource(positions, n_points=n_points)
+    report, _ = build(tmp_path, source, MemoryPlan(1 << 20, 900), monkeypatch)
+    assert (report.n_points, report.n_partitions) == (3000, 1)
+
+
+def test_header_that_promises_a_trillion_points_allocates_nothing_for_them(tmp_path):
+    source = ArraySource(np.zeros((10, 3)), n_points=10**12)
+    with pytest.raises(InputError, match="found 10 points, expected the 1000000000000"):
+        build_scene([source], tmp_path / "s", settings=BuildSettings(memory_bytes=1 << 30))
+    assert not list(tmp_path.iterdir())
+
+
+def test_too_little_memory_says_how_much_is_needed(tmp_path):
+    with pytest.raises(InputError, match=r"memory_bytes = 1000000, expected at least \d+"):
+        build_scene([ArraySource(np.zeros((10, 3)))], tmp_path / "s", settings=BuildSettings(memory_bytes=1_000_000))
+
+
+_MEASURED = """
+import resource, sys
+from pathlib import Path
+from splatpipe.shared.build import BuildSettings, build_scene
+from splatpipe.shared.readers import open_source
+settings = BuildSettings(memory_bytes=int(sys.argv[3]))
+report = build_scene([open_source(Path(sys.argv[1]))], sys.argv[2], settings=settings)
+print(report.n_partitions, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
+"""
+
+
+def test_memory_is_bounded(tmp_path):
+    """4 million points, of which a quarter fits: peak resident memory below the limit and a quarter."""
+    rng = np.random.default_rng(1)
+    np.save(tmp_path / "cloud.npy", rng.uniform(0, 1, (4_000_000, 3)) * [100, 100, 1])
+    memory = 330 << 20
+    command = [sys.executable, "-c", _MEASURED, str(tmp_path / "cloud.npy"), str(tmp_path / "s"), str(memory)]
+    subprocess.run(command, check=True, capture_output=True)  # compiling takes memory of its own, once
+    shutil.rmtree(tmp_path / "s")
+    printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    n_partitions, peak = map(int, printed.split())
+    assert n_partitions > 2
+    assert peak < memory * 1.25
+    Scene.open(tmp_path / "s").verify()

@@ -89,7 +89,8 @@ class Runs:
             )
         run = len(self._run_sizes)
         with writing(self._directory):
-            first.tofile(self._file(run, "first"))
+            with open(self._file(run, "first"), "wb", buffering=0) as file:
+                write_all(file, first)
             columns = {"positions": points.positions, **points.attributes}
             self._workers.map(self._write_column, [(run, name, column, ids) for name, column in columns.items()])
         self._run_sizes.append(len(ids))

@@ -157,6 +157,9 @@ def check_target(out: Path, overwrite: bool) -> None:
     """Raise InputError if a scene must not be written to ``out``."""
     if not out.name:
         raise InputError(f"{out}: cannot be the name of a scene")
+    nearest = next((p for p in out.absolute().parents if p.exists()), None)
+    if nearest and not (nearest.is_dir() and os.access(nearest, os.W_OK | os.X_OK)):
+        raise InputError(f"{out}: cannot be written: {nearest} is not a writable folder")
     if not out.exists() and not out.is_symlink():
         return
     if not out.is_dir() or not ((out / SCENE_FILE).is_file() or not any(out.iterdir())):
