@@ -2,6 +2,7 @@
 
 import math
 import re
+from decimal import Decimal
 
 import numpy as np
 import pytest
@@ -68,6 +69,17 @@ def test_any_decimal_number(scratch, parts):
             rows_of(scratch, line, 3)
     else:
         np.testing.assert_array_equal(rows_of(scratch, line, 3), [[0, value, 0]])
+
+
+def test_numbers_next_to_the_middle_of_two_floats(scratch):
+    rng = np.random.default_rng(11)
+    lower = rng.random(3000) * 2.0 ** rng.integers(-20, 60, 3000)
+    fields = []
+    for a, b in zip(lower.tolist(), np.nextafter(lower, np.inf).tolist(), strict=True):
+        middle = (Decimal(a) + Decimal(b)) / 2
+        fields += [f"{middle:.{digits}e}" for digits in (16, 17, 18, 19)]
+    rows = rows_of(scratch, "\n".join(fields).encode(), 1, max_rows=20_000)
+    np.testing.assert_array_equal(rows[:, 0], [float(field) for field in fields])
 
 
 @settings(max_examples=200, deadline=None, derandomize=True)
