@@ -220,8 +220,8 @@ class TestOnDevice:
             GlComputeRasterizer(points, 2048, 2048)
 
     def test_a_point_size_above_the_drivers_is_refused(self, points):
-        with pytest.raises(DeviceError, match="found point size 100000 px"):
-            GlPointsRasterizer(points, WIDTH, HEIGHT, PointSize(100_000))
+        with pytest.raises(DeviceError, match="found point size 30000 px"):
+            GlPointsRasterizer(points, WIDTH, HEIGHT, PointSize(30_000))
 
     @BOTH
     def test_the_environment_chooses_the_device(self, points, rasterizer, monkeypatch):

@@ -6,8 +6,8 @@ framebuffer, and stores it always instead of only where a point is nearer: that 
 skipping the store costs more than it saves (measured: 1.3 to 2 times the frame time on a closed surface).
 
 Every step is one float32 operation in a fixed order (no fast-math), so a point has the same pixel and depth wherever
-it stands in an array and whichever thread draws it. Arrays are indexed, not sliced, in the loops: numba counts
-references to slices, atomically, in a cache line that all threads share.
+it stands in an array and whichever thread draws it. In the loops arrays are indexed, not sliced or viewed: numba
+counts references to slices and views atomically, in a cache line that all threads share.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def draw(x, y, z, colour, pieces, rows, view, size, words, turn, counter):
     turn : pieces taken at a time.  counter : (1,) int64, shared by the threads of a frame, 0 at its start.
     """
     one_pixel = size[0] == _ONE and size[1] == _ZERO
-    place, depth = np.empty((3, BATCH), np.int32), np.empty(BATCH, np.float32)
+    place, depth = np.empty(3 * BATCH, np.int32), np.empty(BATCH, np.float32)
     gx, gy, gz = np.empty(BATCH, np.float32), np.empty(BATCH, np.float32), np.empty(BATCH, np.float32)
     gcolour = np.empty(BATCH, np.uint32)
     begin = _fetch_add(counter, turn)
@@ -103,44 +103,60 @@ def _draw_pixels(x, y, z, colour, first, n, rows, s, view, words, place, depth):
         inside = (w >= near) & (w <= _FLOAT_MAX) & (u >= _ZERO) & (u < width) & (v >= _ZERO) & (v < height)
         # a NaN or a value beyond int32 must not reach the conversions
         column, row = np.int32(u if inside else _ZERO), np.int32(v if inside else _ZERO)
-        place[0, i] = row * np.int32(width) + column if inside else outside
+        place[i] = row * np.int32(width) + column if inside else outside
         depth[i] = w
+    depth_bits = depth.view(np.uint32)
     for i in range(n):
-        p = np.uintp(place[0, i])
-        words[p] = min(words[p], _word(depth, colour, first, i))
+        p = np.uintp(place[i])
+        words[p] = min(words[p], _word(depth_bits[i], colour[np.uintp(first) + np.uintp(i)]))
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _draw_squares(x, y, z, colour, first, n, rows, s, view, size, words, place, depth):
-    """Draw ``n`` ≤ BATCH points from ``first`` on as squares; ``place`` and ``depth`` are scratch."""
+    """Draw ``n`` ≤ BATCH points from ``first`` on as squares; ``place`` and ``depth`` are scratch.
+
+    ``place`` holds first columns, then first rows, then sides (0 for a point outside the image).
+    """
     near, width, height = view
     smallest, side_at_one, largest = size
     for i in range(n):
         j = np.uintp(first) + np.uintp(i)
         u, v, w = _project(rows, s, x[j], y[j], z[j])
-        side = np.floor(min(max(side_at_one / w, smallest), largest) + _HALF)
-        u = np.floor(u - _HALF * (side - _ONE))
-        v = np.floor(v - _HALF * (side - _ONE))
-        inside = (w >= near) & (w <= _FLOAT_MAX) & (u > -side) & (u < width) & (v > -side) & (v < height)
-        place[0, i] = np.int32(u if inside else _ZERO)
-        place[1, i] = np.int32(v if inside else _ZERO)
-        place[2, i] = np.int32(side if inside else _ZERO)
+        side = side_at_one / w
+        side = side if side > smallest else smallest  # also for NaN
+        side = side if side < largest else largest
+        whole_side = np.int32(side + _HALF)
+        side = np.float32(whole_side)
+        u -= _HALF * (side - _ONE)
+        v -= _HALF * (side - _ONE)
+        inside = (w >= near) & (w <= _FLOAT_MAX)
+        inside &= (u >= _ONE - side) & (u < width) & (v >= _ONE - side) & (v < height)
+        place[i] = _floor(u if inside else _ZERO)
+        place[BATCH + i] = _floor(v if inside else _ZERO)
+        place[2 * BATCH + i] = whole_side if inside else np.int32(0)
         depth[i] = w
+    depth_bits = depth.view(np.uint32)
     stride = np.int64(width)
     for i in range(n):
-        word = _word(depth, colour, first, i)
-        side = place[2, i]
-        for row in range(max(place[1, i], 0), min(place[1, i] + side, np.int64(height))):
-            for column in range(max(place[0, i], 0), min(place[0, i] + side, stride)):
+        word = _word(depth_bits[i], colour[np.uintp(first) + np.uintp(i)])
+        side = place[2 * BATCH + i]
+        for row in range(max(place[BATCH + i], 0), min(place[BATCH + i] + side, np.int64(height))):
+            for column in range(max(place[i], 0), min(place[i] + side, stride)):
                 p = np.uintp(row * stride + column)
                 words[p] = min(words[p], word)
 
 
 @njit(nogil=True, cache=True)
-def _word(depth, colour, first, i):
-    """Framebuffer word of point ``first + i``, whose depth is ``depth[i]``."""
-    bits = np.uint64(depth.view(np.uint32)[i])
-    return bits << np.uint64(32) | np.uint64(colour[np.uintp(first) + np.uintp(i)])
+def _floor(x):
+    """Floor of a float32 within int32, as int32: ``np.floor`` calls a library function and is not vectorised."""
+    whole = np.int32(x)
+    return np.int32(whole - (np.float32(whole) > x))
+
+
+@njit(nogil=True, cache=True)
+def _word(depth_bits, colour):
+    """Framebuffer word of two uint32."""
+    return np.uint64(depth_bits) << np.uint64(32) | np.uint64(colour)
 
 
 @njit(nogil=True, cache=True)
