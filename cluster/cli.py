@@ -190,7 +190,8 @@ def _report(results: dict[str, Any], show: Any, json: Path | None) -> None:
 
     from ..shared.files import write_json
 
-    show(results, Console())
+    console = Console()
+    show(results, console if console.is_terminal else Console(width=140))  # a piped table is not cut
     if json is not None:
         write_json(json, results)
 
