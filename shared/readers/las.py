@@ -21,6 +21,8 @@ from .laz import LazRecords
 from .records import BLOCK_POINTS, Records, sample_records
 from .source import Source, SourceInfo, check_promise, foreign_errors
 
+logging.getLogger("laspy").addHandler(logging.NullHandler())  # what it complains of is raised here, once
+
 _VLR_HEADER_BYTES = 54
 _RGB = ("red", "green", "blue")
 
@@ -32,7 +34,6 @@ class LasSource(Source):
         """Read the header and a sample of the colours, and hold the promised count against the file's size."""
         import laspy
 
-        logging.getLogger("laspy").addHandler(logging.NullHandler())  # what it complains of is raised here, once
         with foreign_errors(path), path.open("rb") as file:
             size = _check_header(path, file)
             self._header = header = laspy.LasHeader.read_from(file, read_evlrs=False)
