@@ -140,7 +140,8 @@ def _sample(job: Job, transport: Transport) -> None:
 def _render(job: Job, transport: Transport) -> None:
     clock = StageClock("render")
     points_drawn: list[int] = []
-    chosen_bytes = job.scene.info.n_cells * RENDER_POINT.itemsize
+    info = job.scene.info
+    chosen_bytes = (info.n_cells + info.n_stored // 2**31 + 1) * RENDER_POINT.itemsize  # a longer range is split
     with job.open_render(lambda *_: None) as render:
         transport.meet()
         for frame in range(job.n_frames):

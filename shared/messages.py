@@ -120,10 +120,10 @@ def encode(message: Message) -> tuple[bytes, memoryview]:
             )
             return header(Kind.CAMERA, message.frame, len(payload)), payload
         case VisibilityBits():
-            payload = memoryview(np.ascontiguousarray(message.bits)).cast("B")
+            payload = np.ascontiguousarray(message.bits).data
             return header(Kind.VISIBILITY, message.frame, len(payload)), payload
         case RenderPoints():
-            payload = memoryview(np.ascontiguousarray(message.entries).view(np.uint8))
+            payload = np.ascontiguousarray(message.entries).view(np.uint8).data
             return header(Kind.RENDER_POINTS, message.frame, len(payload)), payload
 
 

@@ -36,14 +36,26 @@ def test_paths_in_a_file_are_relative_to_it_and_on_the_command_line_to_where_one
 @pytest.mark.parametrize(
     ("text", "overrides", "said"),
     [
-        ("[sampling]\npixel_treshold = 4", [], "unknown key sampling.pixel_treshold, did you mean sampling.pixel_threshold?"),
+        (
+            "[sampling]\npixel_treshold = 4",
+            [],
+            "unknown key sampling.pixel_treshold, did you mean sampling.pixel_threshold?",
+        ),
         ("[samplng]\n", [], "unknown key samplng, did you mean sampling?"),
         ("[sampling]\npixel_threshold = -4", [], "sampling.pixel_threshold = -4, expected greater than or equal to 0"),
         ("[sampling]\npixel_threshold = nan", [], "sampling.pixel_threshold = nan"),
         ("[render]\nthreads = 'two'", [], "render.threads = 'two', expected a valid integer"),
-        ("[render]\nrasterizer = 'vulkan'", [], "render.rasterizer = 'vulkan', expected 'auto', 'cpu', 'gl' or 'gl-points'"),
+        (
+            "[render]\nrasterizer = 'vulkan'",
+            [],
+            "render.rasterizer = 'vulkan', expected 'auto', 'cpu', 'gl' or 'gl-points'",
+        ),
         ("[camera]\nkeyframes = [{ time = 0.0, eye = [0, 0], target = [0, 0, 1] }]", [], "camera.keyframes.0.eye"),
-        ("[camera]\nkeyframes = [{ tim = 0.0 }]", [], "unknown key camera.keyframes.tim, did you mean camera.keyframes.time?"),
+        (
+            "[camera]\nkeyframes = [{ tim = 0.0 }]",
+            [],
+            "unknown key camera.keyframes.tim, did you mean camera.keyframes.time?",
+        ),
         ("camera = 3", [], "camera = 3, expected a table"),
         ("[camera", [], "not valid TOML"),
         ("", ["output.frames"], "--set output.frames: expected section.key=value"),

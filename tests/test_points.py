@@ -3,7 +3,15 @@
 import numpy as np
 import pytest
 from splatpipe.shared.errors import InputError
-from splatpipe.shared.points import NO_NORMAL, PointBatch, concatenate, pack_normals, pack_rgb, unpack_normals, unpack_rgb
+from splatpipe.shared.points import (
+    NO_NORMAL,
+    PointBatch,
+    concatenate,
+    pack_normals,
+    pack_rgb,
+    unpack_normals,
+    unpack_rgb,
+)
 
 
 def test_colours_are_rgba_bytes_in_memory():
