@@ -8,7 +8,7 @@ import sys
 
 import numpy as np
 import pytest
-from splatpipe.shared.build import BuildSettings, build_scene, builder
+from splatpipe.shared.build import BuildSettings, build_scene, builder, runs
 from splatpipe.shared.build.settings import MemoryPlan
 from splatpipe.shared.errors import InputError
 from splatpipe.shared.points import pack_normals
@@ -41,7 +41,9 @@ def build(tmp, source, plan, monkeypatch, **options):
     monkeypatch.setattr(builder, "plan_memory", lambda *_: plan)
     out = tmp / f"scene-{plan.capacity}"
     report = build_scene([source], out, settings=BuildSettings(overwrite=True, **options))
-    Scene.open(out).verify()
+    scene = Scene.open(out)
+    scene.verify()
+    assert {f.name for f in out.iterdir()} == {"scene.json"} | {f"{name}.npy" for name in scene.info.arrays}
     return report, cells_of(out)
 
 
@@ -59,7 +61,8 @@ def test_scene_does_not_depend_on_memory(tmp_path, monkeypatch, kind, point_orde
     report, whole = build(tmp_path, source, MemoryPlan(10_000, 900), monkeypatch, **options)
     assert report.n_partitions == 1
     assert report.spilled_bytes == 0
-    for capacity in (5000, 2100):
+    for capacity, chunk in ((5000, 1 << 17), (2100, 1 << 17), (2100, 300)):
+        monkeypatch.setattr(runs, "_CHUNK", chunk)
         report, parts = build(tmp_path, source, MemoryPlan(capacity, 500), monkeypatch, **options)
         assert report.spilled_bytes > 0
         assert parts == whole
@@ -121,13 +124,13 @@ def test_too_little_memory_says_how_much_is_needed(tmp_path):
 
 
 _MEASURED = """
-import resource, sys
+import sys
 from pathlib import Path
 from splatpipe.shared.build import BuildSettings, build_scene
 from splatpipe.shared.readers import open_source
 settings = BuildSettings(memory_bytes=int(sys.argv[3]))
 report = build_scene([open_source(Path(sys.argv[1]))], sys.argv[2], settings=settings)
-print(report.n_partitions, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
+print(report.n_partitions, report.peak_bytes)
 """
 
 

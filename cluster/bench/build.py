@@ -115,22 +115,22 @@ def _read_through(file: Path) -> None:
 
 
 def _measure(file: Path, n_points: int, memory: int, repeats: int) -> dict[str, Any]:
-    seconds, peaks, reports = [], [], []
+    seconds, reports = [], []
     _build(file, memory)  # compiles the kernels, where they are not cached yet
     for _ in range(repeats):
         os.sync()
-        wall_s, peak_bytes, report = _build(file, memory)
+        wall_s, report = _build(file, memory)
         seconds.append(wall_s)
-        peaks.append(peak_bytes)
         reports.append(report)
     median = statistics.median(seconds)
+    peak_bytes = max(report["peak_bytes"] for report in reports)
     report = reports[seconds.index(min(seconds, key=lambda s: abs(s - median)))]
     return {
         "seconds": {"median": median, "min": min(seconds), "max": max(seconds)},
         "points_per_s": n_points / median,
         "memory_bytes": memory,
-        "peak_bytes": max(peaks),
-        "peak_of_memory": max(peaks) / memory,
+        "peak_bytes": peak_bytes,
+        "peak_of_memory": peak_bytes / memory,
         "input_bytes": file.stat().st_size,
         "scene_bytes": report["bytes"],
         "spilled_bytes": report["spilled_bytes"],
@@ -141,41 +141,40 @@ def _measure(file: Path, n_points: int, memory: int, repeats: int) -> dict[str, 
     }
 
 
-def _build(file: Path, memory: int) -> tuple[float, int, dict[str, Any]]:
-    """(seconds, peak resident bytes, report) of one ``splatpipe build``; the scene is removed again."""
+def _build(file: Path, memory: int) -> tuple[float, dict[str, Any]]:
+    """(seconds, report) of one ``splatpipe build``; the scene is removed again."""
     with tempfile.TemporaryDirectory(dir=file.parent, prefix="build-") as folder:
         told = Path(folder, "report.json")
         command = [sys.executable, "-m", "splatpipe.cluster", "build", str(file), "-o", str(Path(folder, "scene"))]
         command += ["--memory", str(memory), "--json", str(told)]
         start = time.perf_counter()
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-        assert process.stderr is not None
-        error = process.stderr.read()
-        _, status, usage = os.wait4(process.pid, 0)
+        done = subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, check=False)
         wall_s = time.perf_counter() - start
-        process.returncode = os.waitstatus_to_exitcode(status)
-        if process.returncode:
-            raise SplatpipeError(f"bench build: exit status {process.returncode}: {error.strip()[-300:]}")
+        if done.returncode:
+            raise SplatpipeError(f"bench build: exit status {done.returncode}: {done.stderr.strip()[-300:]}")
         report = json.loads(told.read_text())
         shutil.rmtree(Path(folder, "scene"))
-    return wall_s, usage.ru_maxrss * 1024, report
+    return wall_s, report
 
 
 def print_build(results: dict[str, Any], console: Console) -> None:
     """One line a case."""
     table = Table(title=f"LAS file of {results['n_points']:,} points → scene, {results['repeats']} builds each")
-    for name in ("case", "order", "seconds (min–max)", "M points/s", "memory MB", "peak MB", "written MB", "stages s"):
-        table.add_column(name, justify="left" if name in ("case", "order") else "right")
+    for name in ("case", "order"):
+        table.add_column(name)
+    for name in ("s median", "min", "max", "M points/s", "memory MB", "peak MB", "written MB"):
+        table.add_column(name, justify="right")
     for row in results["rows"]:
-        s = row["seconds"]
+        s, written = row["seconds"], row["scene_bytes"] + row["spilled_bytes"]
         table.add_row(
             row["case"],
             row["order"],
-            f"{s['median']:.2f} ({s['min']:.2f}–{s['max']:.2f})",
+            *(f"{s[key]:.2f}" for key in ("median", "min", "max")),
             f"{row['points_per_s'] / 1e6:.2f}",
-            f"{row['memory_bytes'] / 1e6:.0f}",
-            f"{row['peak_bytes'] / 1e6:.0f}",
-            f"{(row['scene_bytes'] + row['spilled_bytes']) / 1e6:.0f}",
-            " ".join(f"{stage} {seconds:.2f}" for stage, seconds in row["stage_s"].items()),
+            *(f"{n / 1e6:.0f}" for n in (row["memory_bytes"], row["peak_bytes"], written)),
         )
     console.print(table)
+    for row in results["rows"]:
+        stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in row["stage_s"].items())
+        console.print(f"{row['case']}, {row['order']}: {stages} s; the rest is starting the process")
+    console.print(f"{results['machine']['cpu']}, {results['machine']['cores']} cores")

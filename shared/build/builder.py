@@ -20,7 +20,7 @@ from .parallel import Workers
 from .partition import Subdivision
 from .point_array import PointArrayWriter, block_level, block_levels_of
 from .runs import Partition, Runs
-from .settings import BuildReport, BuildSettings, MemoryPlan, plan_memory
+from .settings import BuildReport, BuildSettings, MemoryPlan, peak_resident_bytes, plan_memory
 from .streamed import append_streamed_leaf
 from .subtree import build_subtree
 from .writer import SceneWriter, settings_json
@@ -37,10 +37,11 @@ def build_scene(
 ) -> BuildReport:
     """Build the scene directory ``out`` from all points of the sources.
 
-    progress : called with (``read`` or ``write``, points done, points in all or None), from more than one thread.
+    progress : called with (``read``, ``bounds`` or ``write``, points done, points in all or None), from any thread.
     Points that do not fit into ``settings.memory_bytes`` are sorted into runs inside ``OUT.partial`` and built
     partition by partition; cells, sets and their order are the same for any memory and any number of threads, the
-    place of a cell's range in the point-array is not. A build that was killed is started again from clean.
+    place of a cell's range in the point-array is not. The runs take as much disk as the points, beside the scene.
+    A build that was killed is started again from clean.
     Raises InputError for inputs that cannot be used, a target that must not be replaced, or a full disk; nothing is
     left behind then.
     Cost: O(n); each input is read once, twice if it does not fit into memory and states no bounds or wrong ones.
@@ -80,6 +81,7 @@ class _Build:
             else:
                 for partition in runs.partitions(self.memory.capacity):
                     self.add_from_runs(runs, partition, tally.n_points)
+                runs.discard()
             with self.timed("write"):
                 self.assembly.append_top(self.array, self.workers)
             with self.timed("finish"):
@@ -94,6 +96,7 @@ class _Build:
             n_partitions=self.assembly.n_partitions,
             spilled_bytes=runs.bytes if runs else 0,
             bytes=sum(array.bytes for array in info.arrays.values()),
+            peak_bytes=peak_resident_bytes(),
             stage_s=self.stage_s,
         )
 

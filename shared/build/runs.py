@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 
 from ..octree import MAX_LEVEL
-from ..points import ATTRIBUTES, PointBatch
+from ..points import PointBatch
 from .flatness import N_MOMENTS, add_moments, bucket_moments, central_moments, flatness
 from .ingest import Columns
 from .morton import count_buckets, keys_of
@@ -49,7 +49,7 @@ def _gather_rows(positions, ids, begin, end, out):
 
 
 class Runs:
-    """Sorted runs in a directory of their own, which the owner of the scene's directory removes.
+    """Sorted runs in a directory of their own, until they are discarded.
 
     origin, edge : the root cube, which holds all points.
     Raises InputError if the disk is full.
@@ -69,7 +69,7 @@ class Runs:
         self._origin, self._edge = origin, edge
         self._rule = rule
         self._workers = workers
-        self._run_sizes: list[int] = []
+        self._n_runs = 0
         self._counts = np.zeros(_N_BUCKETS, np.int64)
         self._moments = np.zeros((_N_BUCKETS, N_MOMENTS), np.int64) if rule.flatness > 0 else None
         self._ahead: dict[tuple[int, int], np.ndarray] = {}
@@ -87,13 +87,13 @@ class Runs:
             self._workers.map(
                 bucket_moments, [(keys, ids, first, a, b, BUCKET_LEVEL, self._moments) for a, b in pieces]
             )
-        run = len(self._run_sizes)
+        run = self._n_runs
         with writing(self._directory):
             with open(self._file(run, "first"), "wb", buffering=0) as file:
                 write_all(file, first)
             columns = {"positions": points.positions, **points.attributes}
             self._workers.map(self._write_column, [(run, name, column, ids) for name, column in columns.items()])
-        self._run_sizes.append(len(ids))
+        self._n_runs += 1
         self.bytes += first.nbytes + sum(column.nbytes for column in columns.values())
 
     def built_for(self, origin: np.ndarray, edge: float) -> bool:
@@ -179,64 +179,78 @@ class Runs:
 
     def load(self, partition: Partition) -> tuple[PointBatch, np.ndarray]:
         """(points, keys) of a partition that fits."""
-        columns = Columns(partition.n_points, self._attributes)
-        if partition.level > BUCKET_LEVEL:
+        if partition.level <= BUCKET_LEVEL:
+            points = self._read_buckets(*_buckets(partition.level, partition.code), self._attributes)
+        else:
+            columns = Columns(partition.n_points, self._attributes)
             for batch in self.stream(partition.level, partition.code):
                 columns.add(batch)
             points = columns.points()
-        else:
-            points = columns.whole()
-            slices = self._slices(partition.level, partition.code)
-            out = {"positions": points.positions, **points.attributes}
-            self._workers.map(self._read_slices, [(name, slices, column) for name, column in out.items()])
         return points, self._keys(points)
 
     def stream(self, level: int, code: int, attributes: tuple[str, ...] | None = None) -> Iterator[PointBatch]:
         """The points of a cell in the order of one sort in memory, in small batches; all attributes or some."""
         wanted = self._attributes if attributes is None else attributes
-        above = max(level - BUCKET_LEVEL, 0)
-        for run, start, stop in self._slices(level - above, code >> 3 * above, by_bucket=True):
-            for begin in range(start, stop, _CHUNK):
-                end = min(begin + _CHUNK, stop)
-                batch = PointBatch(self._read(run, "positions", begin, end, np.empty((end - begin, 3))))
-                inside = np.ones(end - begin, bool)
-                if above:
-                    inside = self._keys(batch) >> 3 * (MAX_LEVEL - level) == code
-                if not inside.any():
-                    continue
-                for name in wanted:
-                    batch.attributes[name] = self._read(run, name, begin, end, np.empty(end - begin, ATTRIBUTES[name]))
-                yield batch.select(inside)
+        for begin, end, n in self._small_groups(*_buckets(level, code)):
+            if n <= _CHUNK:
+                batches = iter([self._read_buckets(begin, end, wanted)])
+            else:
+                batches = self._stream_slices(self._slices(begin, end), wanted)
+            for batch in batches:
+                keys = self._keys(batch)
+                if level > BUCKET_LEVEL:
+                    batch = batch.select(keys >> 3 * (MAX_LEVEL - level) == code)
+                elif end - begin > 1:
+                    batch = batch.select(np.argsort(keys >> 3 * (MAX_LEVEL - BUCKET_LEVEL), kind="stable"))
+                if len(batch):
+                    yield batch
+
+    def _small_groups(self, begin: int, end: int) -> Iterator[tuple[int, int, int]]:
+        """(begin, end, points) of consecutive buckets: together at most a chunk, or a single one with points."""
+        first, n = begin, 0
+        for bucket in range(begin, end):
+            here = int(self._counts[bucket])
+            if n and n + here > _CHUNK:
+                yield first, bucket, n
+                n = 0
+            if not n:
+                first = bucket
+            n += here
+        if n:
+            yield first, end, n
 
     def _keys(self, points: PointBatch) -> np.ndarray:
         return keys_of(points.positions, self._origin, self._edge, self._workers)
 
-    def _slices(self, level: int, code: int, *, by_bucket: bool = False) -> list[tuple[int, int, int]]:
-        """(run, start, stop) of a cell of at most the bucket level: one a run, or one a bucket and run."""
-        width = 3 * (BUCKET_LEVEL - level)
-        begin, count = code << width, (1 << width) + 1
-        if not by_bucket:
-            ends = [
-                [
-                    int(np.fromfile(self._file(run, "first"), "<i8", 1, offset=8 * b)[0])
-                    for b in (begin, begin + count - 1)
-                ]
-                for run in range(len(self._run_sizes))
-            ]
-            return [(run, start, stop) for run, (start, stop) in enumerate(ends)]
-        first = [
-            np.fromfile(self._file(run, "first"), "<i8", count, offset=8 * begin) for run in range(len(self._run_sizes))
-        ]
-        buckets, runs = np.nonzero(np.diff(first, axis=1).T)
-        return [(int(r), int(first[r][b]), int(first[r][b + 1])) for b, r in zip(buckets, runs, strict=True)]
+    def _slices(self, begin: int, end: int) -> list[tuple[int, int, int]]:
+        """(run, start, stop) of the buckets [begin, end) in every run."""
 
-    def _read_slices(self, name: str, slices: list[tuple[int, int, int]], out: np.ndarray) -> None:
+        def offset(run: int, bucket: int) -> int:
+            return int(np.fromfile(self._file(run, "first"), "<i8", 1, offset=8 * bucket)[0])
+
+        return [(run, offset(run, begin), offset(run, end)) for run in range(self._n_runs)]
+
+    def _stream_slices(self, slices: list[tuple[int, int, int]], attributes: tuple[str, ...]) -> Iterator[PointBatch]:
+        for run, start, stop in slices:
+            for begin in range(start, stop, _CHUNK):
+                yield self._read_slices([(run, begin, min(begin + _CHUNK, stop))], attributes)
+
+    def _read_buckets(self, begin: int, end: int, attributes: tuple[str, ...]) -> PointBatch:
+        return self._read_slices(self._slices(begin, end), attributes)
+
+    def _read_slices(self, slices: list[tuple[int, int, int]], attributes: tuple[str, ...]) -> PointBatch:
+        points = Columns(sum(stop - start for _, start, stop in slices), attributes).whole()
+        columns = {"positions": points.positions, **points.attributes}
+        self._workers.map(self._read_column, [(name, slices, column) for name, column in columns.items()])
+        return points
+
+    def _read_column(self, name: str, slices: list[tuple[int, int, int]], out: np.ndarray) -> None:
         at = 0
         for run, start, stop in slices:
             self._read(run, name, start, stop, out[at : at + stop - start])
             at += stop - start
 
-    def _read(self, run: int, name: str, start: int, stop: int, out: np.ndarray) -> np.ndarray:
+    def _read(self, run: int, name: str, start: int, stop: int, out: np.ndarray) -> None:
         """Fill ``out``, C-contiguous, with rows [start, stop) of a run's column."""
         if stop > start:
             data = out.reshape(-1).view(np.uint8).data
@@ -247,4 +261,12 @@ class Runs:
                     if not n_read:
                         raise OSError(f"{file.name}: ended early")
                     data = data[n_read:]
-        return out
+
+
+def _buckets(level: int, code: int) -> tuple[int, int]:
+    """The range of buckets that a cell covers, or the one it lies in."""
+    if level > BUCKET_LEVEL:
+        bucket = code >> 3 * (level - BUCKET_LEVEL)
+        return bucket, bucket + 1
+    width = 3 * (BUCKET_LEVEL - level)
+    return code << width, (code + 1) << width

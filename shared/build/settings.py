@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -65,6 +66,7 @@ class BuildReport:
     dropped_attributes : in some of the inputs, but not in all of them.
     n_partitions : subtrees that were built one after the other; 1 if the input fitted into memory.
     spilled_bytes : written to sorted runs and read again; 0 if the input fitted into memory.
+    bytes : of the scene's arrays.  peak_bytes : most memory the process held so far.
     stage_s : seconds in each stage.
     """
 
@@ -77,6 +79,7 @@ class BuildReport:
     n_partitions: int
     spilled_bytes: int
     bytes: int
+    peak_bytes: int
     stage_s: dict[str, float] = field(default_factory=dict)
 
 
@@ -122,6 +125,18 @@ def resident_bytes() -> int:
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except OSError:
         return 0
+
+
+def peak_resident_bytes() -> int:
+    """The most memory the process has held.
+
+    From ``/proc`` where there is one: ``getrusage`` counts what the parent held when it started this process.
+    """
+    try:
+        status = Path("/proc/self/status").read_text()
+        return int(status.partition("VmHWM:")[2].split()[0]) * 1024
+    except (OSError, IndexError, ValueError):
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
 @dataclass(frozen=True)
