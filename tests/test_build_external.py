@@ -12,6 +12,7 @@ from splatpipe.shared.build import BuildSettings, build_scene, builder, runs
 from splatpipe.shared.build.settings import MemoryPlan
 from splatpipe.shared.errors import InputError
 from splatpipe.shared.points import pack_normals
+from splatpipe.shared.readers import open_source
 from splatpipe.shared.store import Scene
 
 from .build_sources import ArraySource, cells_of, columns_for
@@ -66,6 +67,18 @@ def test_scene_does_not_depend_on_memory(tmp_path, monkeypatch, kind, point_orde
         report, parts = build(tmp_path, source, MemoryPlan(capacity, 500), monkeypatch, **options)
         assert report.spilled_bytes > 0
         assert parts == whole
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    "file", ["formats/lion_takanawa.copc.laz", "models/stanford-bunny_35947.ply", "formats/fusa.laz"]
+)
+def test_real_scans_do_not_depend_on_memory(tmp_path, monkeypatch, data_dir, file):
+    source = open_source(data_dir / file)
+    _, whole = build(tmp_path, source, MemoryPlan(1 << 20, 1 << 18), monkeypatch)
+    report, parts = build(tmp_path, source, MemoryPlan(10_000, 4096), monkeypatch)
+    assert report.n_partitions > 3
+    assert parts == whole
 
 
 class CountingSource(ArraySource):

@@ -77,6 +77,7 @@ class _Build:
             self.array = PointArrayWriter(self.writer, self.attributes, origin, edge)
             self.assembly = Assembly(self.settings.point_order, self.settings.points_per_cell)
             if runs is None:
+                assert held is not None
                 self.add_partition(held, keys_of(held.positions, origin, edge, self.workers), 0, 0, tally.n_points)
             else:
                 for partition in runs.partitions(self.memory.capacity):
@@ -106,8 +107,8 @@ class _Build:
         yield
         self.stage_s[stage] = self.stage_s.get(stage, 0.0) + time.perf_counter() - start
 
-    def read_all(self) -> tuple[PointBatch, Runs | None, Tally]:
-        """The points in memory, or else none of them and the runs that hold them."""
+    def read_all(self) -> tuple[PointBatch | None, Runs | None, Tally]:
+        """The points in memory, or the runs that hold them."""
         held, runs, tally = self.read_with(self.declared)
         bounds = root_bounds(self.declared, tally)
         if runs is not None and bounds is not self.declared and not runs.built_for(*root_cube(*bounds)):
@@ -115,7 +116,7 @@ class _Build:
             held, runs, tally = self.read_with(bounds)
         return held, runs, tally
 
-    def read_with(self, bounds: Bounds | None) -> tuple[PointBatch, Runs | None, Tally]:
+    def read_with(self, bounds: Bounds | None) -> tuple[PointBatch | None, Runs | None, Tally]:
         promised = [source.info.n_points for source in self.sources]
         expected = None if None in promised else sum(n for n in promised if n is not None)
         capacity = self.memory.capacity
@@ -135,10 +136,11 @@ class _Build:
             self.progress("read", tally.n_points, expected)
         if not tally.n_points:
             raise InputError(f"{self.sources[0].info.path}: found no finite point, expected at least one")
-        if runs is not None and columns.n_points:
+        if runs is None:
+            return columns.points(), None, tally
+        if columns.n_points:
             runs.add(columns.points())
-            columns.clear()
-        return columns.points(), runs, tally
+        return None, runs, tally
 
     def new_runs(self, bounds: Bounds) -> Runs:
         directory = self.writer.partial / "runs"
