@@ -38,7 +38,7 @@ def build_scene(
     """Build the scene directory ``out`` from all points of the sources.
 
     progress : called with (``read``, ``bounds`` or ``write``, points done, points in all or None), from any thread.
-    Points that do not fit into ``settings.memory_bytes`` are sorted into runs inside ``OUT.partial`` and built
+    Points that do not fit into ``settings.memory_bytes`` are sorted into runs inside ``.OUT.partial`` and built
     partition by partition; cells, sets and their order are the same for any memory and any number of threads, the
     place of a cell's range in the point-array is not. The runs take as much disk as the points, beside the scene.
     A build that was killed is started again from clean.

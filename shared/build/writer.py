@@ -1,4 +1,4 @@
-"""Writing a scene: into ``OUT.partial`` beside the target, renamed to it once everything is whole."""
+"""Writing a scene: into ``.OUT.partial`` beside the target, renamed to it once everything is whole."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class ColumnFile:
 
 
 class SceneWriter:
-    """Owns ``OUT.partial`` from the start of a build to the rename; a context manager.
+    """Owns ``.OUT.partial`` from the start of a build to the rename; a context manager.
 
     A killed build leaves only that directory, which the next build of the same scene removes: it starts clean.
     Leaving the context without ``commit`` removes it. The data files are not forced to the disk (a scene whose machine
@@ -87,11 +87,10 @@ class SceneWriter:
 
     def __init__(self, out: Path, *, overwrite: bool) -> None:
         self.out = out
-        self.partial = out.with_name(out.name + ".partial")
-        self._replaced = out.with_name(out.name + ".replaced")
+        self.partial = out.with_name(f".{out.name}.partial")
+        self._replaced = out.with_name(f".{out.name}.replaced")
         self._overwrite = overwrite
         self.columns: dict[str, ColumnFile] = {}
-        self.arrays: dict[str, ArrayInfo] = {}
         check_target(out, overwrite)
 
     def __enter__(self) -> SceneWriter:
@@ -104,13 +103,22 @@ class SceneWriter:
             except OSError:
                 os.close(self._lock)
                 raise InputError(f"{self.out}: another build of it is running ({self.partial})") from None
-            _empty(self.partial)
-            if self._replaced.exists():  # killed between the two renames of ``commit``
-                if self.out.exists():
-                    shutil.rmtree(self._replaced)
-                else:
-                    self._replaced.rename(self.out)
+            try:
+                _empty(self.partial)
+                self._recover()
+                check_target(self.out, self._overwrite)
+            except BaseException:
+                self.__exit__()
+                raise
         return self
+
+    def _recover(self) -> None:
+        """Put right what a build left that was killed between the two renames of ``commit``."""
+        if self._replaced.exists():
+            if self.out.exists():
+                shutil.rmtree(self._replaced)
+            else:
+                self._replaced.rename(self.out)
 
     def __exit__(self, *_: object) -> None:
         for column in self.columns.values():
