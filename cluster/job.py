@@ -116,3 +116,7 @@ class RenderStage:
         """Hand the picture to the output; waits while that is behind."""
         if self._sink is not None and picture is not None:
             self._sink.put(frame, picture)
+
+    def times(self) -> dict[str, list[float]]:
+        """Seconds of encoding, frame by frame, by kind of output; complete once the output is closed."""
+        return self._sink.times if self._sink is not None else {}

@@ -11,7 +11,17 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from ..shared.messages import RENDER_POINT, Kind, decode_camera, decode_render_points, decode_visibility
+import numpy as np
+
+from ..shared.messages import (
+    RENDER_POINT,
+    Kind,
+    RenderPoints,
+    VisibilityBits,
+    decode_camera,
+    decode_render_points,
+    decode_visibility,
+)
 from .job import Job
 from .record import StageClock, rank_record, spread_ms
 from .transport import Transport
@@ -27,7 +37,7 @@ Progress = Callable[[str, int], None]
 def run_single(job: Job, progress: Progress) -> dict[str, Any]:
     """All three nodes in this process, frame after frame; the statistics of the run. Imports no MPI."""
     clocks = [StageClock(role) for role in ROLES]
-    points_drawn: list[int] = []
+    counts = FrameCounts()
     octree = job.scene.octree()
     culling, sampling = job.culling_node(octree), job.sampling_node(octree)
     sampling.process(job.camera(0), culling.process(job.camera(0)))  # compiles, or loads what was compiled
@@ -43,7 +53,7 @@ def run_single(job: Job, progress: Progress) -> dict[str, Any]:
                 picture = render.draw(camera, chosen)
             with clocks[RENDER].waiting():
                 render.show(frame, picture)
-            points_drawn.append(chosen.n_points)
+            counts.add(bits, chosen)
             progress("rendering", frame + 1)
         rendered_s = time.perf_counter() - started
     return {
@@ -52,7 +62,7 @@ def run_single(job: Job, progress: Progress) -> dict[str, Any]:
         "stages": {clock.stage: clock.summary() for clock in clocks},
         "messages": {},
         "latency_ms": spread_ms([sum(t) for t in zip(*(clock.work_s for clock in clocks), strict=True)]),
-        "points_drawn": points_drawn,
+        "per_frame": {f"{clock.stage}_s": clock.work_s for clock in clocks} | counts.lists() | render.times(),
         "rendered_s": rendered_s,
         "finished_s": time.perf_counter() - started,
     }
@@ -83,6 +93,7 @@ def _coordinate(job: Job, transport: Transport, progress: Progress) -> dict[str,
     culling.process(job.camera(0))
     progress("loading the scene", 0)
     transport.meet()
+    counts = FrameCounts()
     issued_s: list[float] = []
     latency_s: list[float] = []
 
@@ -103,18 +114,19 @@ def _coordinate(job: Job, transport: Transport, progress: Progress) -> dict[str,
         with clock.working():
             bits = culling.process(camera)
         transport.send(SAMPLING, bits)
+        counts.add(bits)
     while len(latency_s) < job.n_frames:
         frame_done()
     rendered_s = time.perf_counter() - started
     of_sampling, of_render = (transport.receive_note(rank, Kind.STATISTICS)[1] for rank in (SAMPLING, RENDER))
-    ranks = [_statistics(transport, clock), of_sampling, of_render]
+    ranks = [_statistics(transport, clock, counts), of_sampling, of_render]
     return {
         "rasterizer": of_render["rasterizer"],
         "ranks": [rank["rank"] for rank in ranks],
         "stages": {rank["stage"]: rank["summary"] for rank in ranks},
         "messages": {kind: count for rank in ranks for kind, count in rank["messages"].items()},
         "latency_ms": spread_ms(latency_s),
-        "points_drawn": of_render["points_drawn"],
+        "per_frame": {name: values for rank in ranks for name, values in rank["per_frame"].items()},
         "rendered_s": rendered_s,
         "finished_s": time.perf_counter() - started,
     }
@@ -134,12 +146,12 @@ def _sample(job: Job, transport: Transport) -> None:
         with clock.working():
             chosen = sampling.process(camera, bits)
         transport.send(RENDER, chosen)
-    transport.send_note(CULLING, Kind.STATISTICS, job.n_frames, _statistics(transport, clock))
+    transport.send_note(CULLING, Kind.STATISTICS, job.n_frames, _statistics(transport, clock, FrameCounts()))
 
 
 def _render(job: Job, transport: Transport) -> None:
     clock = StageClock("render")
-    points_drawn: list[int] = []
+    counts = FrameCounts()
     info = job.scene.info
     chosen_bytes = (info.n_cells + info.n_stored // 2**31 + 1) * RENDER_POINT.itemsize  # a longer range is split
     with job.open_render(lambda *_: None) as render:
@@ -152,16 +164,39 @@ def _render(job: Job, transport: Transport) -> None:
                 picture = render.draw(camera, chosen)
             with clock.waiting():
                 render.show(frame, picture)
-            points_drawn.append(chosen.n_points)
+            counts.add(chosen)
             transport.send_note(CULLING, Kind.FRAME_DONE, frame)
-    more = {"points_drawn": points_drawn, "rasterizer": render.description}
-    transport.send_note(CULLING, Kind.STATISTICS, job.n_frames, _statistics(transport, clock) | more)
+    statistics = _statistics(transport, clock, counts) | {"rasterizer": render.description}
+    statistics["per_frame"] |= render.times()
+    transport.send_note(CULLING, Kind.STATISTICS, job.n_frames, statistics)
 
 
-def _statistics(transport: Transport, clock: StageClock) -> dict[str, Any]:
+class FrameCounts:
+    """How much of everything each frame had: cells that may be seen, render-points entries, points drawn."""
+
+    def __init__(self) -> None:
+        self._lists: dict[str, list[int]] = {}
+
+    def add(self, *messages: VisibilityBits | RenderPoints) -> None:
+        """Count a frame's messages. Outside the stage clocks: it is no work of the pipeline."""
+        for message in messages:
+            if isinstance(message, VisibilityBits):
+                found = {"cells_visible": int(np.bitwise_count(message.bits).sum())}
+            else:
+                found = {"entries": len(message.entries), "points": message.n_points}
+            for name, count in found.items():
+                self._lists.setdefault(name, []).append(count)
+
+    def lists(self) -> dict[str, list[int]]:
+        """Name → one count a frame."""
+        return self._lists
+
+
+def _statistics(transport: Transport, clock: StageClock, counts: FrameCounts) -> dict[str, Any]:
     return {
         "stage": clock.stage,
         "summary": clock.summary(),
         "rank": rank_record(clock.stage, transport.rank),
         "messages": transport.traffic(),
+        "per_frame": {f"{clock.stage}_s": clock.work_s} | counts.lists(),
     }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import queue
 import threading
+import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from fractions import Fraction
 from pathlib import Path
@@ -33,6 +34,11 @@ class FrameSink:
         self._room = threading.BoundedSemaphore(backlog)
         self._pending: list[Future[None]] = []
         self._film = _Film(directory / "film.mp4", fps) if mp4 else None
+        self.times: dict[str, list[float]] = {}
+        if png:
+            self.times["png_s"] = []
+        if self._film is not None:
+            self.times["mp4_s"] = self._film.times
         self.bytes_written = 0
 
     def put(self, frame: int, rgba: np.ndarray) -> None:
@@ -60,6 +66,7 @@ class FrameSink:
             self._pending.pop(0).result()
 
     def _write_png(self, frame: int, rgba: np.ndarray) -> None:
+        started = time.perf_counter()
         try:
             from PIL import Image
 
@@ -68,6 +75,7 @@ class FrameSink:
             image = Image.fromarray(rgba[..., :3] if opaque else rgba)
             write_whole(path, lambda part: image.save(part, format="PNG", compress_level=_PNG_LEVEL))
             self.bytes_written += path.stat().st_size
+            self.times["png_s"].append(time.perf_counter() - started)
         finally:
             self._room.release()
 
@@ -85,6 +93,7 @@ class _Film:
         self._part = path.with_name(f".{path.name}.part")
         self._rate = Fraction(fps).limit_denominator(1001)
         self._frames: queue.Queue[np.ndarray | None] = queue.Queue(maxsize=8)
+        self.times: list[float] = []
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._encode, name="film")
         self._thread.start()
@@ -116,6 +125,7 @@ class _Film:
         with self._av.open(str(self._part), "w", format="mp4") as container:
             stream: Any = None
             while (rgba := self._frames.get()) is not None:
+                started = time.perf_counter()
                 height, width = (side - side % 2 for side in rgba.shape[:2])  # 4:2:0 needs even sides
                 if stream is None:
                     stream = container.add_stream("libx264", rate=self._rate)
@@ -124,6 +134,7 @@ class _Film:
                 rgb = np.ascontiguousarray(rgba[:height, :width, :3])
                 for packet in stream.encode(self._av.VideoFrame.from_ndarray(rgb, format="rgb24")):
                     container.mux(packet)
+                self.times.append(time.perf_counter() - started)
             if stream is not None:
                 for packet in stream.encode():
                     container.mux(packet)

@@ -66,11 +66,11 @@ def test_three_ranks_draw_the_same_bits_as_one(scenes, config, tmp_path, order):
             assert done.returncode == 0, done.stderr
             drawn[topology] = pictures(out)
             run = json.loads((out / "run.json").read_text())
-            assert (run["topology"], len(run["points_drawn"])) == (topology, 3)
+            assert (run["topology"], len(run["per_frame"]["points"])) == (topology, 3)
         assert drawn["single"].shape == (3, 90, 160, 3)
         assert np.array_equal(drawn["single"], drawn["pipelined"])
         assert len(np.unique(drawn["single"][0].reshape(-1, 3), axis=0)) > 100, "the picture shows something"
-    assert run["points_drawn"][0] < 60_000, "a coarse threshold draws fewer points"
+    assert run["per_frame"]["points"][0] < 60_000, "a coarse threshold draws fewer points"
 
 
 @needs_mpi

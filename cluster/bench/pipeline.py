@@ -7,17 +7,13 @@ Runs alternate, so that a change of the machine's speed meets both.
 
 from __future__ import annotations
 
-import json
 import os
-import subprocess
-import sys
-import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ...shared.errors import SplatpipeError
+from ..measured import measured_run
 from ..record import machine_record
 
 
@@ -26,7 +22,7 @@ def bench_pipeline(config: Path, overrides: list[str], repeats: int) -> dict[str
     runs: dict[str, list[dict[str, Any]]] = {"single": [], "pipelined": []}
     for _ in range(repeats):
         for topology, done in runs.items():
-            done.append(_run(config, [*overrides, f"pipeline.topology={topology}"]))
+            done.append(measured_run(config, [*overrides, f"pipeline.topology={topology}"]))
     stages = {
         name: float(np.median([run["stages"][name]["work_s"] / run["frames"] for run in runs["single"]]))
         for name in runs["single"][0]["stages"]
@@ -63,15 +59,3 @@ def print_pipeline(results: dict[str, Any], console: Any) -> None:
         f"pipelined reaches {results['share_of_slowest_stage']:.1%} of what {results['slowest_stage']} reaches alone, "
         f"three ranks on {results['cores_for_three_ranks']} cores"
     )
-
-
-def _run(config: Path, overrides: list[str]) -> dict[str, Any]:
-    with tempfile.TemporaryDirectory() as folder:
-        sets = [*overrides, "output.png=false", "output.mp4=false", f"output.directory={folder}/out"]
-        command = [sys.executable, "-m", "splatpipe.cluster", "run", str(config)]
-        done = subprocess.run(
-            command + [part for item in sets for part in ("--set", item)], capture_output=True, text=True, check=False
-        )
-        if done.returncode:
-            raise SplatpipeError(done.stderr.strip().removeprefix("splatpipe: "))
-        return json.loads((Path(folder) / "out" / "run.json").read_text())
