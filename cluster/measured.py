@@ -1,4 +1,4 @@
-"""Whole runs as measurements: a fresh process each, its output in a folder that goes away, its ``run.json`` returned."""
+"""Whole runs as measurements: a fresh process each, its ``run.json`` returned, its output thrown away."""
 
 from __future__ import annotations
 

@@ -166,8 +166,9 @@ def _render(job: Job, transport: Transport) -> None:
                 render.show(frame, picture)
             counts.add(chosen)
             transport.send_note(CULLING, Kind.FRAME_DONE, frame)
-    statistics = _statistics(transport, clock, counts) | {"rasterizer": render.description}
+    statistics = _statistics(transport, clock, counts)
     statistics["per_frame"] |= render.times()
+    statistics["rasterizer"] = render.description
     transport.send_note(CULLING, Kind.STATISTICS, job.n_frames, statistics)
 
 
