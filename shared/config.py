@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -21,11 +21,16 @@ PositiveInt = Annotated[int, Field(ge=1)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
-class _Section(BaseModel):
+class Section(BaseModel):
+    """A table of a configuration file: unknown keys are refused, values checked and then fixed."""
+
     model_config = ConfigDict(extra="forbid", strict=False, frozen=True, allow_inf_nan=False)
 
 
-class Keyframe(_Section):
+AnySection = TypeVar("AnySection", bound=Section)
+
+
+class Keyframe(Section):
     """One key of a keyframe path: where the camera is, at what time in [0, 1], what it looks at."""
 
     time: Annotated[float, Field(ge=0, le=1)]
@@ -34,14 +39,14 @@ class Keyframe(_Section):
     fov_deg: Annotated[float, Field(gt=0, lt=180)] | None = None
 
 
-class SceneSection(_Section):
+class SceneSection(Section):
     """``[scene]``."""
 
     path: str = ""
     verify: bool = True
 
 
-class CameraSection(_Section):
+class CameraSection(Section):
     """``[camera]``."""
 
     path: Literal["orbit", "keyframes", "poses"] = "orbit"
@@ -59,19 +64,19 @@ class CameraSection(_Section):
     poses: list[Matrix] = []
 
 
-class CullingSection(_Section):
+class CullingSection(Section):
     """``[culling]``."""
 
     backface: bool = False
 
 
-class SamplingSection(_Section):
+class SamplingSection(Section):
     """``[sampling]``."""
 
     pixel_threshold: Annotated[float, Field(ge=0, le=4096)] = 16.0
 
 
-class RenderSection(_Section):
+class RenderSection(Section):
     """``[render]``."""
 
     rasterizer: Literal["auto", "cpu", "gl", "gl-points"] = "auto"
@@ -85,7 +90,7 @@ class RenderSection(_Section):
     background: str = "#1e2127"
 
 
-class PipelineSection(_Section):
+class PipelineSection(Section):
     """``[pipeline]``."""
 
     topology: Literal["auto", "single", "pipelined"] = "auto"
@@ -93,7 +98,7 @@ class PipelineSection(_Section):
     timeout_s: Positive = 300.0
 
 
-class OutputSection(_Section):
+class OutputSection(Section):
     """``[output]``."""
 
     directory: str = "frames"
@@ -103,7 +108,7 @@ class OutputSection(_Section):
     mp4: bool = False
 
 
-class RunConfig(_Section):
+class RunConfig(Section):
     """Every setting of ``splatpipe run``."""
 
     scene: SceneSection = SceneSection()
@@ -124,29 +129,47 @@ def load_config(path: Path | str, overrides: list[str] | None = None) -> RunConf
     Raises ConfigError naming the file and key, what was found and what was expected; an unknown key is refused and
     the nearest known one suggested.
     """
-    path = Path(path)
-    try:
-        text = path.read_bytes()
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
-    try:
-        data = tomllib.loads(text.decode("utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: not valid TOML: {error}") from None
-    for section, key in _PATH_KEYS:
-        value = data.get(section, {}).get(key) if isinstance(data.get(section), dict) else None
-        if isinstance(value, str) and value:
-            data[section][key] = str(path.parent / value)
+    data = read_config(path)
     for override in overrides or []:
         _apply(data, override)
     return parse_config(data, source=str(path))
 
 
+def read_config(path: Path | str) -> dict[str, Any]:
+    """The tables of a run's TOML file as they stand there, paths made relative to the working directory.
+
+    Raises ConfigError if it cannot be read or is not TOML.
+    """
+    data = read_toml(path)
+    for section, key in _PATH_KEYS:
+        value = data.get(section, {}).get(key) if isinstance(data.get(section), dict) else None
+        if isinstance(value, str) and value:
+            data[section][key] = str(Path(path).parent / value)
+    return data
+
+
+def read_toml(path: Path | str) -> dict[str, Any]:
+    """The tables of a TOML file. Raises ConfigError if it cannot be read or is not TOML."""
+    try:
+        text = Path(path).read_bytes()
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+    try:
+        return tomllib.loads(text.decode("utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not valid TOML: {error}") from None
+
+
 def parse_config(data: dict[str, Any], source: str = "configuration") -> RunConfig:
     """The validated configuration of nested tables. Raises ConfigError as ``load_config`` does."""
-    _refuse_unknown(data, RunConfig, source, "")
+    return validated(RunConfig, data, source)
+
+
+def validated(model: type[AnySection], data: dict[str, Any], source: str) -> AnySection:
+    """Nested tables as ``model``; ConfigError names the key, what was found and what was expected."""
+    _refuse_unknown(data, model, source, "")
     try:
-        return RunConfig.model_validate(data)
+        return model.model_validate(data)
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
