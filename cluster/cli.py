@@ -134,6 +134,59 @@ def verify(scene: Annotated[Path, typer.Argument(help="Scene directory.")]) -> N
     verify_command(scene)
 
 
+@app.command()
+def experiment(
+    config: Annotated[Path, typer.Argument(help="Experiment file; configs/experiments has examples.")],
+    fresh: Annotated[bool, typer.Option("--fresh", help="Start over instead of running what is missing.")] = False,
+    json: JsonOption = None,
+) -> None:
+    """A grid of settings, each run several times in fresh processes: one table, its spread and where it came from.
+
+    Killed and started again, it runs only what is missing.
+
+    Example: `splatpipe experiment configs/experiments/threads.toml`
+    """
+    from .experiment.command import experiment_command
+
+    experiment_command(config, fresh=fresh, json_path=json)
+
+
+@app.command()
+def plan(
+    config: Annotated[Path, typer.Argument(help="Configuration of a run.")],
+    sets: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a key.")] = None,
+    report: Annotated[Path | None, typer.Option(metavar="STEM", help="Write STEM.html and STEM.md.")] = None,
+    json: JsonOption = None,
+) -> None:
+    """Say what a run needs, what it leaves out and why, and what that gains. Draws nothing.
+
+    Example: `splatpipe plan city.toml --report plan`
+    """
+    from .plan.command import plan_command, print_plan, report_plan
+
+    results = plan_command(config, sets or [])
+    _report(results, print_plan, json)
+    if report is not None:
+        report_plan(results, report)
+
+
+@app.command()
+def stability(
+    only: Annotated[str, typer.Option(metavar="NAME", help="Run the cases whose name contains this.")] = "",
+    json: JsonOption = None,
+    report: Annotated[
+        Path | None, typer.Option("--report", metavar="STEM", help="Write STEM.html and STEM.md.")
+    ] = None,
+) -> None:
+    """Run the stiff and extreme cases: value, bound and verdict of each. Exit status 1 if one fails.
+
+    Example: `splatpipe stability --only projection --report stability`
+    """
+    from .stability.suite import stability_command
+
+    raise typer.Exit(stability_command(only, json, report))
+
+
 @bench_app.command("raster")
 def bench_raster(
     points: Annotated[int, typer.Option(help="Number of points.", min=1000)] = 4_000_000,

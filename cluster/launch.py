@@ -17,7 +17,7 @@ import subprocess
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -64,10 +64,16 @@ def say_failed(message: str, status: int) -> None:
         print(line, file=sys.stderr, flush=True)
 
 
-def launch(arguments: Sequence[str], ranks: int, on_record: Callable[[dict[str, Any]], None]) -> int:
+def launch(
+    arguments: Sequence[str],
+    ranks: int,
+    on_record: Callable[[dict[str, Any]], None],
+    variables: Mapping[str, str] | None = None,
+) -> int:
     """Run ``python -m splatpipe.cluster ARGUMENTS`` on ``ranks`` ranks; the exit status.
 
     on_record : called with each record that is not about a rank's start.
+    variables : added to the environment of the ranks.
     Raises DeviceError where there is no mpiexec; SplatpipeError naming rank and cause when a rank dies without a word.
     """
     mpiexec = find_mpiexec()
@@ -83,7 +89,7 @@ def launch(arguments: Sequence[str], ranks: int, on_record: Callable[[dict[str, 
         "splatpipe.cluster",
         *arguments,
     ]
-    environment = os.environ | {EXPECTED_RANKS: str(ranks), "PYTHONUNBUFFERED": "1"}
+    environment = os.environ | {EXPECTED_RANKS: str(ranks), "PYTHONUNBUFFERED": "1"} | dict(variables or {})
     environment |= {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
     process = subprocess.Popen(
         command,

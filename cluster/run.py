@@ -6,22 +6,27 @@ import hashlib
 import json
 import os
 import time
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
-from ..shared.config import RunConfig, load_config
+from ..shared.config import load_config
 from ..shared.errors import ConfigError, InputError, SplatpipeError
 from ..shared.files import write_json
 from .job import Job
 from .launch import EXPECTED_RANKS, inside_mpi, launch, mpi_available, record, say_failed
-from .plan import left_out
+from .plan.needs import left_out
+from .plan.topology import Decision, decide
+from .plan.workload import Workload
 from .progress import FrameProgress
 from .record import RECORD_VERSION, machine_record
 from .sink import prepare_output
 
 PIPELINED_RANKS = 3
+DECISION = "SPLATPIPE_DECISION"
+"""Environment variable in which the launcher tells its ranks why they are."""
 
 
 def run_command(config_path: Path, overrides: list[str], json_path: Path | None) -> int:
@@ -29,16 +34,19 @@ def run_command(config_path: Path, overrides: list[str], json_path: Path | None)
     if inside_mpi():
         return _run_rank(config_path, overrides, json_path)
     config = load_config(config_path, overrides)
-    topology = _topology(config)
+    if config.pipeline.topology == "pipelined" and not mpi_available():
+        raise ConfigError("pipeline.topology = 'pipelined': MPI is missing; install splatpipe[mpi] or choose 'single'")
     job = Job(config)  # everything that can be wrong with the input is said here, before anything starts
     prepare_output(job.output)
     with FrameProgress(config.output.frames) as progress:
-        if topology == "single":
+        progress.show("planning", 0)
+        decision = decide(job)
+        if decision.topology == "single":
             from .pipeline import run_single
 
-            summary = _finish(job, "single", run_single(job, progress.show), config_path, json_path)
+            summary = _finish(job, decision, run_single(job, progress.show), config_path, json_path)
         else:
-            status = _run_ranks(config_path, overrides, json_path, progress)
+            status = _run_ranks(config_path, overrides, json_path, decision, progress)
             if status:
                 return status  # the rank that failed has said why
             summary = json.loads((job.output / "run.json").read_text())
@@ -46,23 +54,21 @@ def run_command(config_path: Path, overrides: list[str], json_path: Path | None)
     return 0
 
 
-def _topology(config: RunConfig) -> str:
-    wanted = config.pipeline.topology
-    if wanted == "auto":
-        return "pipelined" if mpi_available() else "single"
-    if wanted == "pipelined" and not mpi_available():
-        raise ConfigError("pipeline.topology = 'pipelined': MPI is missing; install splatpipe[mpi] or choose 'single'")
-    return wanted
-
-
-def _run_ranks(config_path: Path, overrides: list[str], json_path: Path | None, progress: FrameProgress) -> int:
+def _run_ranks(
+    config_path: Path, overrides: list[str], json_path: Path | None, decision: Decision, progress: FrameProgress
+) -> int:
     """Start the ranks and show what they report; their exit status."""
     arguments = ["run", str(config_path)]
     for override in overrides:
         arguments += ["--set", override]
     if json_path is not None:
         arguments += ["--json", str(json_path)]
-    return launch(arguments, PIPELINED_RANKS, lambda content: progress.show(content["doing"], content["done"]))
+    return launch(
+        arguments,
+        PIPELINED_RANKS,
+        lambda content: progress.show(content["doing"], content["done"]),
+        {DECISION: decision.to_json()},
+    )
 
 
 def _run_rank(config_path: Path, overrides: list[str], json_path: Path | None) -> int:
@@ -112,13 +118,20 @@ def _run_rank(config_path: Path, overrides: list[str], json_path: Path | None) -
             else:
                 result = run_pipelined(job, transport, show)
         if result is not None:
-            topology = "single" if single else "pipelined"
-            summary = _finish(job, topology, result | {"mpi": transport.library}, config_path, json_path)
+            decision = _decided(single, transport.size)
+            summary = _finish(job, decision, result | {"mpi": transport.library}, config_path, json_path)
             if EXPECTED_RANKS not in os.environ:
                 _tell(summary)
     except BaseException as error:
         _abort(transport, role, error)
     return 0
+
+
+def _decided(single: bool, ranks: int) -> Decision:
+    """What the launcher decided; where there was none, what the person who started the ranks did."""
+    if DECISION in os.environ:
+        return Decision.from_json(os.environ[DECISION])
+    return Decision("single" if single else "pipelined", f"started on {ranks} ranks by mpiexec")
 
 
 def _abort(transport: Any, role: str, error: BaseException) -> None:
@@ -135,13 +148,14 @@ def _abort(transport: Any, role: str, error: BaseException) -> None:
 
 
 def _finish(
-    job: Job, topology: str, result: dict[str, Any], config_path: Path, json_path: Path | None
+    job: Job, decision: Decision, result: dict[str, Any], config_path: Path, json_path: Path | None
 ) -> dict[str, Any]:
     """Write ``run.json`` (last, so that a killed run leaves none); what it holds, less the per-frame lists."""
     n_frames = job.n_frames
     content = {
         "record_version": RECORD_VERSION,
-        "topology": topology,
+        "topology": decision.topology,
+        "plan": asdict(decision),
         "config_file": config_path.name,
         "config_sha256": hashlib.sha256(job.config.model_dump_json().encode()).hexdigest(),
         "config": job.config.model_dump(mode="json"),
@@ -152,7 +166,7 @@ def _finish(
         "seconds": result["finished_s"],
         **{key: result[key] for key in result if key not in ("rendered_s", "finished_s")},
         "output": job.outputs(),
-        "left_out": left_out(job, topology, result["rasterizer"]),
+        "left_out": left_out(job, Workload.of_run(job, result["per_frame"]), decision),
         "machine": machine_record(),
     }
     for path in filter(None, (job.output / "run.json", json_path)):

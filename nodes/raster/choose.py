@@ -24,8 +24,7 @@ def make_rasterizer(
     threads : of ``cpu``; None for one a core.
     Raises ConfigError for another name, DeviceError if OpenGL is asked for and missing.
     """
-    if name == "auto":
-        name = "gl" if _has_gpu() else "cpu"
+    name = resolve_rasterizer(name)
     match name:
         case "cpu":
             from .cpu import CpuRasterizer
@@ -40,6 +39,13 @@ def make_rasterizer(
 
             return GlPointsRasterizer(points, width, height, size)
     raise ConfigError(f"render.rasterizer = {name!r}, expected one of {', '.join(RASTERIZERS)}")
+
+
+def resolve_rasterizer(name: str) -> str:
+    """``gl`` or ``cpu`` for ``auto``; any other name is itself. Cost: that of looking for a GPU, the first time."""
+    if name != "auto":
+        return name
+    return "gl" if _has_gpu() else "cpu"
 
 
 def _has_gpu() -> bool:

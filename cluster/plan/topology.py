@@ -1,0 +1,156 @@
+"""One rank or three: what both would take, and the choice with its reason.
+
+On one rank a frame takes culling + sampling + render. On three ranks it takes the slowest of the three and the
+messages' share; but where all ranks share the cores of one machine, never less than the work of all of them spread
+over the cores. So three ranks save at most the time in which the cores would otherwise not all be busy, and a scene
+whose culling and sampling take next to nothing is faster on one rank, as the thesis's bunny is (Table 6-1).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import asdict, dataclass
+from typing import Literal
+
+from ...nodes.raster.choose import resolve_rasterizer
+from ..job import Job
+from ..launch import mpi_available
+from .workload import Workload
+
+Topology = Literal["single", "pipelined"]
+
+
+@dataclass(frozen=True)
+class UnitCosts:
+    """Seconds of one core for a unit of work, fitted to runs on 2 cores of an AMD EPYC (Zen 3, no GPU).
+
+    They decide only what cannot be tried without loading the points: another machine's clock scales them together,
+    and culling and sampling are timed where the run starts.
+    """
+
+    point_s: float = 7e-9
+    square_s: float = 12e-9
+    pixel_s: float = 4e-9
+    gl_point_s: float = 0.5e-9
+    picture_s: float = 3e-9
+    png_s: float = 25e-9
+    mp4_s: float = 25e-9
+    message_s: float = 0.4e-3
+    start_s: float = 1.0
+    back_face_s: float = 5e-9
+    lod_s: float = 5e-9
+    flatness_s: float = 30e-9
+    checksum_s: float = 1e-9
+    opengl_s: float = 0.3
+    colour_maps_s: float = 0.2
+
+
+COSTS = UnitCosts()
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Seconds of an average frame by topology, and what they are made of.
+
+    parallel_s : of the render stage, spread over its threads.  busy_s : work of all stages and encoders, on one core.
+    """
+
+    culling_s: float
+    sampling_s: float
+    render_s: float
+    busy_s: float
+    single_s: float
+    pipelined_s: float
+    cores: int
+
+
+@dataclass(frozen=True)
+class Decision:
+    """The topology of a run and why; estimates where they decided."""
+
+    topology: Topology
+    reason: str
+    estimate: Estimate | None = None
+
+    def to_json(self) -> str:
+        """As text, for the ranks that carry the decision out."""
+        return json.dumps(asdict(self))
+
+    @classmethod
+    def from_json(cls, text: str) -> Decision:
+        """What ``to_json`` wrote."""
+        content = json.loads(text)
+        estimate = content.pop("estimate")
+        return cls(**content, estimate=Estimate(**estimate) if estimate else None)
+
+
+def estimate(job: Job, work: Workload, cores: int, costs: UnitCosts = COSTS) -> Estimate:
+    """What an average frame takes on one rank and on three that share ``cores``."""
+    output = job.config.output
+    shown = output.png or output.mp4
+    picture_s = costs.picture_s * work.pixels * shown
+    if resolve_rasterizer(job.config.render.rasterizer) == "cpu":
+        threads = min(job.config.render.threads or cores, cores)
+        point_s = costs.point_s if job.largest_point_px == 1 else costs.square_s
+        render_core_s = point_s * work.points + costs.pixel_s * work.pixels
+        render_s = render_core_s / threads + picture_s
+    else:
+        render_core_s = 0.0
+        render_s = costs.gl_point_s * work.points + picture_s
+    encode_s = (costs.png_s * output.png + costs.mp4_s * output.mp4) * work.pixels
+    busy_s = work.culling_s + work.sampling_s + render_core_s + picture_s + encode_s
+    stages = work.culling_s, work.sampling_s, render_s
+    return Estimate(
+        *stages,
+        busy_s=busy_s,
+        single_s=max(sum(stages), busy_s / cores),
+        pipelined_s=max(*stages, busy_s / cores) + costs.message_s,
+        cores=cores,
+    )
+
+
+def choose_topology(job: Job, work: Workload, costs: UnitCosts = COSTS) -> Decision:
+    """The topology that is done first, starting the ranks included; one rank where they are even."""
+    found = estimate(job, work, len(os.sched_getaffinity(0)), costs)
+    gain_s = found.single_s - found.pipelined_s
+    selection_s = found.culling_s + found.sampling_s
+    said = f"culling and sampling take {_ms(selection_s)} of an estimated {_ms(found.single_s)} a frame"
+    if gain_s <= 0:
+        saved_s = max(0.0, gain_s + costs.message_s)
+        return Decision(
+            "single",
+            f"{said}: three ranks on {found.cores} cores would save {_ms(saved_s)} "
+            f"({saved_s / found.single_s:.1%}) and spend {_ms(costs.message_s)} on messages",
+            found,
+        )
+    total_s = gain_s * job.n_frames
+    if total_s <= costs.start_s:
+        return Decision(
+            "single",
+            f"{said}: three ranks would save {_ms(gain_s)} a frame, {total_s:.2g} s in {job.n_frames} frames, "
+            f"and take {costs.start_s:.2g} s longer to start",
+            found,
+        )
+    return Decision(
+        "pipelined",
+        f"{said}: three ranks need {_ms(found.pipelined_s)}, which saves {total_s:.2g} s in {job.n_frames} frames",
+        found,
+    )
+
+
+def decide(job: Job) -> Decision:
+    """The topology of a run: as the configuration says; for ``auto`` what an estimate says, where there is a choice.
+
+    Cost: nothing, or for ``auto`` that of ``Workload.of_look``.
+    """
+    wanted = job.config.pipeline.topology
+    if wanted != "auto":
+        return Decision(wanted, f"pipeline.topology = {wanted!r}")
+    if not mpi_available():
+        return Decision("single", "MPI is not installed: splatpipe[mpi]")
+    return choose_topology(job, Workload.of_look(job))
+
+
+def _ms(seconds: float) -> str:
+    return f"{seconds * 1e3:.2g} ms"

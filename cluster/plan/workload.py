@@ -1,0 +1,65 @@
+"""What an average frame of a run has to do."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..job import Job
+
+LOOK_FRAMES = 5
+
+
+@dataclass(frozen=True)
+class Workload:
+    """Counts and seconds of an average frame.
+
+    cells : of the octree.  cells_visible, entries, points : what culling lets through, what sampling asks for.
+    pixels : of the picture.  culling_s, sampling_s : measured on this machine.
+    render_s : measured where a run has drawn, else None.
+    """
+
+    cells: int
+    cells_visible: float
+    entries: float
+    points: float
+    pixels: int
+    culling_s: float
+    sampling_s: float
+    render_s: float | None = None
+
+    @classmethod
+    def of_look(cls, job: Job) -> Workload:
+        """Of ``LOOK_FRAMES`` frames spread over the path, culled and sampled but not drawn. Loads no point.
+
+        Cost: the octree loaded once, and those frames' culling and sampling.
+        """
+        octree = job.scene.octree()
+        culling, sampling = job.culling_node(octree), job.sampling_node(octree)
+        sampling.process(job.camera(0), culling.process(job.camera(0)))  # compiles, or loads what was compiled
+        rows = []
+        for frame in np.unique(np.linspace(0, job.n_frames - 1, LOOK_FRAMES).astype(int)):
+            camera = job.camera(int(frame))
+            started = time.perf_counter()
+            bits = culling.process(camera)
+            culled = time.perf_counter()
+            chosen = sampling.process(camera, bits)
+            sampled = time.perf_counter()
+            visible = int(np.bitwise_count(bits.bits).sum())
+            rows.append((visible, len(chosen.entries), chosen.n_points, culled - started, sampled - culled))
+        visible, entries, points, culling_s, sampling_s = np.mean(rows, axis=0).tolist()
+        return cls(len(octree), visible, entries, points, _pixels(job), culling_s, sampling_s)
+
+    @classmethod
+    def of_run(cls, job: Job, per_frame: dict[str, Any]) -> Workload:
+        """Of every frame of a run, from the lists of its ``run.json``."""
+        names = ("cells_visible", "entries", "points", "culling_s", "sampling_s", "render_s")
+        mean = {name: float(np.mean(per_frame[name])) for name in names}
+        return cls(cells=job.scene.info.n_cells, pixels=_pixels(job), **mean)
+
+
+def _pixels(job: Job) -> int:
+    return job.config.camera.width * job.config.camera.height
