@@ -65,5 +65,5 @@ def print_pipeline(results: dict[str, Any], console: Any) -> None:
     console.print(
         f"pipelined reaches {results['share_of_slowest_stage']:.1%} of what {results['slowest_stage']} reaches alone, "
         f"three ranks on {results['cores_for_three_ranks']} cores; "
-        f"{results['slowest_stage']} works {results['share_of_time_it_works']:.1%} of the time, the rest is the pipeline"
+        f"it works {results['share_of_time_it_works']:.1%} of the time, the rest is the pipeline"
     )

@@ -101,7 +101,6 @@ class LasSource(Source):
                 case _:
                     column[rows] = records[attribute]
 
-
     def _byte(self, name: str) -> int:
         """Where a field stands in a record."""
         fields = self._dtype.fields or {}
