@@ -38,15 +38,23 @@ def add_moments(keys, ids, start, stop, level, moments):
 
 @njit(nogil=True, cache=True)
 def central_moments(moments, central):
-    """(10,) float64 count, mean, central second moments of exact (10,) int64 ``moments``."""
+    """(10,) float64 count, mean, central second moments of exact (10,) int64 ``moments``.
+
+    Sums are moved to the key step next to the mean in integers (wrapping where a part does not fit: the whole does), so
+    that what is left to subtract in float64 is at most half a step a point.
+    """
     n = max(moments[0], 1)
     central[0] = moments[0]
+    step, rest = np.empty(3, np.int64), np.empty(3)
     for axis in range(3):
         central[1 + axis] = moments[1 + axis] / n
+        step[axis] = (2 * moments[1 + axis] + n) // (2 * n)
+        rest[axis] = moments[1 + axis] - step[axis] * n
     p = 4
     for a in range(3):
         for b in range(a, 3):
-            central[p] = moments[p] - central[1 + a] * moments[1 + b]
+            moved = moments[p] - step[a] * moments[1 + b] - step[b] * moments[1 + a] + n * step[a] * step[b]
+            central[p] = moved - rest[a] * rest[b] / n
             p += 1
 
 
