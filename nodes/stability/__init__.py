@@ -1,0 +1,14 @@
+"""Stiff and extreme cases of scenes: points built into a store, culled, sampled and drawn, against float64.
+
+==============  ===============================================================
+module          owns
+==============  ===============================================================
+``chain``       positions → file → store → nodes → frame, and its references
+``projection``  pixels under far translations and wide and narrow views
+``extents``     clouds from nanometres to a light minute
+``depth``       near and far, points on and behind the camera
+``clouds``      degenerate clouds: coincident, collinear, one hot octant, …
+``viewports``   pixel borders and the smallest and largest images
+``large``       more points than 32 bits count
+==============  ===============================================================
+"""

@@ -1,0 +1,71 @@
+"""The stability suite passes: one test a case; and the suite says so when it does not."""
+
+import json
+
+import pytest
+from splatpipe.cluster.stability import suite
+from splatpipe.cluster.stability.suite import all_cases
+from splatpipe.shared.errors import InputError
+from splatpipe.shared.stability.case import FAILED, OUT_OF_REACH, PASSED, case, cases, expect, out_of_reach, run
+
+
+@pytest.mark.parametrize("case", all_cases(), ids=lambda case: case.name)
+def test_case(case):
+    outcome = run(case)
+    if outcome.verdict == OUT_OF_REACH:
+        pytest.skip(outcome.reason)
+    assert outcome.verdict == PASSED, f"{outcome.value} {case.unit}, bound {case.bound}: {outcome.reason}"
+
+
+def outcome_of(function, bound=1.0):
+    return run(case("a/case", bound=bound, unit="px")(function))
+
+
+def failing():
+    raise ZeroDivisionError("division by zero")
+
+
+def unmeasured():
+    expect([], "there are points")
+
+
+def test_a_value_that_is_no_number_an_exception_and_a_broken_premise_are_failures():
+    assert outcome_of(lambda: 1.0).verdict == PASSED
+    assert outcome_of(lambda: 1.0001).verdict == FAILED
+    assert outcome_of(lambda: float("nan"), bound=float("inf")).verdict == FAILED
+    assert outcome_of(failing).reason == "ZeroDivisionError: division by zero"
+    assert "there are points" in outcome_of(unmeasured).reason
+    assert run(out_of_reach("a/case", "something", "no such thing yet")).reason == "no such thing yet"
+
+
+def test_a_family_has_a_case_for_each_parameter_and_says_what_its_function_says():
+    def twice(x):
+        """Twice
+        the number.
+        """
+        return 2 * x
+
+    family = cases("a/family", bounds={1.0: 2.0, 2e6: 3.0}, unit="")(twice)
+    assert [(c.name, c.what, run(c).verdict) for c in family] == [
+        ("a/family 1", "Twice the number.", PASSED),
+        ("a/family 2e+06", "Twice the number.", FAILED),
+    ]
+
+
+def test_names_are_unique_and_say_something():
+    names = [c.name for c in all_cases()]
+    assert len(set(names)) == len(names) > 20
+    assert all(c.what and "/" in c.name for c in all_cases())
+
+
+def test_the_command_writes_what_it_measured_and_fails_when_a_case_does(tmp_path, monkeypatch, capsys):
+    chosen = [case("a/good", bound=1.0, unit="px")(lambda: 0.5), case("a/bad", bound=1.0, unit="px")(lambda: 2.0)]
+    monkeypatch.setattr(suite, "all_cases", lambda: chosen)
+    assert suite.stability_command("good", None, None) == 0
+    assert suite.stability_command("", tmp_path / "s.json", tmp_path / "s") == 1
+    assert "1 passed, 1 failed, 0 out of reach" in capsys.readouterr().out
+    record = json.loads((tmp_path / "s.json").read_text())["cases"]
+    assert [(r["case"], r["value"], r["verdict"]) for r in record] == [("a/good", 0.5, PASSED), ("a/bad", 2.0, FAILED)]
+    assert "a/bad" in (tmp_path / "s.md").read_text()
+    with pytest.raises(InputError, match="no case of that name"):
+        suite.stability_command("nothing", None, None)
