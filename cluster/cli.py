@@ -171,6 +171,63 @@ def plan(
 
 
 @app.command()
+def model(
+    config: Annotated[
+        Path | None, typer.Argument(help="Configuration of a run; not needed if the file says it all.")
+    ] = None,
+    sets: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a key.")] = None,
+    system: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Read the cluster from a file: configs/systems has examples.")
+    ] = None,
+    save_system: Annotated[Path | None, typer.Option(metavar="FILE", help="Write what was measured.")] = None,
+    fps: Annotated[float | None, typer.Option(help="Frames a second to hold; default: output.fps.")] = None,
+    report: Annotated[Path | None, typer.Option(metavar="STEM", help="Write STEM.html and STEM.md.")] = None,
+    json: JsonOption = None,
+) -> None:
+    """Measure the ranks, their links and a run, and say which bandwidth or rate each rank keeps up with.
+
+    Example: `splatpipe model city.toml --fps 30 --report model`
+    """
+    from .model.command import make_model
+    from .model.present import make_report, print_model, record
+
+    found = make_model(config, sets or [], system, save_system, fps)
+    _report(record(found), lambda _, console: print_model(found, console), json)
+    if report is not None:
+        make_report(found, " ".join(["splatpipe", *sys.argv[1:]])).write(report)
+
+
+@app.command("model-rank", hidden=True)
+def model_rank(
+    config: Path,
+    output: Path,
+    rasterizer: str,
+    render_rank: int,
+    sets: Annotated[list[str] | None, typer.Option("--set")] = None,
+) -> None:
+    """One rank's part of `splatpipe model`, which starts it."""
+    from .model.measure import rank_command
+
+    rank_command(config, sets or [], output, rasterizer, render_rank)
+
+
+@app.command()
+def error(
+    config: Annotated[Path, typer.Argument(help="TOML file: base run, scenes, sweeps; configs/error has examples.")],
+    json: JsonOption = None,
+) -> None:
+    """Error against run time: sweep settings, hold every picture against a float64 reference of all points.
+
+    Writes errors.csv and a report (HTML and Markdown) with work–precision diagrams into run.output.directory.
+
+    Example: `splatpipe error configs/error/demo.toml --json errors.json`
+    """
+    from .error.command import error_command
+
+    error_command(config, json)
+
+
+@app.command()
 def stability(
     only: Annotated[str, typer.Option(metavar="NAME", help="Run the cases whose name contains this.")] = "",
     json: JsonOption = None,

@@ -103,6 +103,18 @@ class Transport:
         """The highest status of all ranks. Collective."""
         return int(self._comm.allreduce(status, op=self._mpi.MAX))
 
+    def bounce(self, peer: int, payload: np.ndarray, *, serve: bool) -> None:
+        """Send an (n,) uint8 payload to a rank and take it back, or the other way round, with MPI's own blocking calls.
+
+        For measuring a link, not for work: no header, no limit, no politeness.
+        """
+        buffer = [payload, self._mpi.BYTE]
+        if serve:
+            self._comm.Send(buffer, peer)
+        self._comm.Recv(buffer, peer)
+        if not serve:
+            self._comm.Send(buffer, peer)
+
     def traffic(self) -> dict[str, dict[str, int]]:
         """Messages and bytes (headers included) this rank has sent, by kind."""
         return {kind: {"count": self._count[kind], "bytes": n} for kind, n in self._bytes.items()}

@@ -18,6 +18,9 @@ Projection = Callable[[ResidentPoints, Camera, np.ndarray], tuple[np.ndarray, np
 """(points, camera, (n,) point indices) → (n,) image positions u, v in pixels and depths w."""
 
 
+_BATCH_POINTS = 1 << 20
+
+
 def point_indices(entries: np.ndarray) -> np.ndarray:
     """(n,) int64: the points that (m,) RENDER_POINT entries draw, in their order."""
     runs = [np.arange(first, first + length, stride) for first, length, stride in entries.tolist()]
@@ -47,15 +50,13 @@ def project_float32(
         return u / w, v / w, w
 
 
-def reference_frame(
-    points: ResidentPoints,
-    camera: Camera,
-    entries: np.ndarray,
-    size: PointSize = PointSize(),  # noqa: B008 (frozen)
-    projection: Projection = project,
-) -> np.ndarray:
-    """(height, width) uint64 framebuffer words. Arguments as in ``Rasterizer``; entries are not checked."""
-    index = point_indices(entries)
+def squares(
+    points: ResidentPoints, camera: Camera, index: np.ndarray, size: PointSize, projection: Projection = project
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The squares of those of the (n,) points that reach into the image.
+
+    Returns (m,) int64 first row, first column and side in pixels, (m,) depth, (m,) index of the point.
+    """
     u, v, w = projection(points, camera, index)
     number = w.dtype.type
     with np.errstate(all="ignore"):
@@ -67,9 +68,33 @@ def reference_frame(
         visible = (w >= number(camera.near)) & (w <= np.finfo(np.float32).max)
         visible &= (first_column < camera.width) & (first_column > -side)
         visible &= (first_row < camera.height) & (first_row > -side)
-    first_column, first_row, side = (a[visible].astype(np.int64) for a in (first_column, first_row, side))
-    depth_bits = w[visible].astype(np.float32).view(np.uint32).astype(np.uint64)
-    word = depth_bits << np.uint64(32) | points.colour[index[visible]]
+    first_row, first_column, side = (a[visible].astype(np.int64) for a in (first_row, first_column, side))
+    return first_row, first_column, side, w[visible], index[visible]
+
+
+def covered_pixels(points: ResidentPoints, camera: Camera, entries: np.ndarray, size: PointSize) -> int:
+    """Pixels that the points of (m,) RENDER_POINT entries cover, hidden ones included: D_FP of thesis Table 3-1."""
+    total = 0
+    index = point_indices(entries)
+    for begin in range(0, len(index), _BATCH_POINTS):
+        row, column, side, _, _ = squares(points, camera, index[begin : begin + _BATCH_POINTS], size)
+        rows = np.minimum(row + side, camera.height) - np.maximum(row, 0)
+        columns = np.minimum(column + side, camera.width) - np.maximum(column, 0)
+        total += int((rows * columns).sum())
+    return total
+
+
+def reference_frame(
+    points: ResidentPoints,
+    camera: Camera,
+    entries: np.ndarray,
+    size: PointSize = PointSize(),  # noqa: B008 (frozen)
+    projection: Projection = project,
+) -> np.ndarray:
+    """(height, width) uint64 framebuffer words. Arguments as in ``Rasterizer``; entries are not checked."""
+    first_row, first_column, side, w, index = squares(points, camera, point_indices(entries), size, projection)
+    depth_bits = w.astype(np.float32).view(np.uint32).astype(np.uint64)
+    word = depth_bits << np.uint64(32) | points.colour[index]
 
     frame = np.full((camera.height, camera.width), FRAMEBUFFER_EMPTY)
     for dy, dx in np.ndindex(side.max(initial=0), side.max(initial=0)):
