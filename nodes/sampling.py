@@ -44,6 +44,7 @@ class SamplingNode:
         self._edge = np.ldexp(octree.edge, -np.arange(MAX_LEVEL + 1))
         self._stored_order = np.argsort(octree.first_point, kind="stable").astype(np.int32)
         self._n_drawn = np.empty(len(octree), np.int64)
+        self._leaf_points = np.where(octree.is_leaf, octree.n_points, 0)
         n_stored = int((octree.first_point + octree.n_points).max())
         self._n_splits = 2 * n_stored // MAX_RANGE  # a piece fills at least half an entry
 
@@ -56,7 +57,8 @@ class SamplingNode:
         depth-first order. A leaf above the threshold yields all its points.
 
         Raises MessageError if the bits belong to another frame or another octree.
-        Cost: O(cells in the level-of-detail window) plus a scan of one word per cell.
+        Cost: O(cells in the level-of-detail window) plus a scan of one word per cell. With a threshold of 0 no
+        projected size is computed.
         """
         tree = self._octree
         if bits.frame != camera.frame or bits.n_cells != len(tree):
@@ -64,9 +66,20 @@ class SamplingNode:
                 f"visibility bits: found frame {bits.frame} of {bits.n_cells} cells,"
                 f" expected frame {camera.frame} of {len(tree)}"
             )
+        n_cut = self._cut(camera, bits) if self.pixel_threshold else self._all_leaves(bits)
+        entries = np.empty(n_cut + self._n_splits, RENDER_POINT)
+        strided = tree.point_order == "depth-first"
+        n_entries = _merge(
+            tree.first_point, tree.n_points, self._n_drawn, self._stored_order, strided, MAX_RANGE, entries
+        )
+        return RenderPoints(camera.frame, entries[:n_entries])
+
+    def _cut(self, camera: Camera, bits: VisibilityBits) -> int:
+        """Fill ``_n_drawn``; the size of the cut."""
+        tree = self._octree
         visible = bits.bits.view()
         visible.flags.writeable = False  # received or fresh, one type to the compiler
-        n_cut = _cut(
+        return _cut(
             tree.centers,
             tree.level,
             tree.parent,
@@ -82,12 +95,11 @@ class SamplingNode:
             self.pixel_threshold,
             self._n_drawn,
         )
-        entries = np.empty(n_cut + self._n_splits, RENDER_POINT)
-        strided = tree.point_order == "depth-first"
-        n_entries = _merge(
-            tree.first_point, tree.n_points, self._n_drawn, self._stored_order, strided, MAX_RANGE, entries
-        )
-        return RenderPoints(camera.frame, entries[:n_entries])
+
+    def _all_leaves(self, bits: VisibilityBits) -> int:
+        """The same without level of detail: every visible leaf, whatever its size on the screen."""
+        np.multiply(self._leaf_points, bits.unpack(), out=self._n_drawn)
+        return int(np.count_nonzero(self._n_drawn))
 
 
 @njit(nogil=True, cache=True)

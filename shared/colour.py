@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -95,18 +95,25 @@ class Colouring:
             _colormap(colormap)
         return cls(mode, attribute, colormap, value_range, word)
 
+    def settled(self, scene: Scene) -> Colouring:
+        """The same with its range of values found, so that other copies of the scene's points get the same colours."""
+        if self.mode not in _COLOUR_MAPPED or self.value_range is not None:
+            return self
+        return replace(self, value_range=_robust_range(_scalars(scene, self.mode), scene.info.n_stored))
+
 
 def colour_words(scene: Scene, colouring: Colouring) -> np.ndarray:
     """(n_stored,) uint32 colour words of a scene's points.
 
-    Cost: one read of the attribute; memory 4 bytes a point (none for rgb, whose stored column is mapped).
+    Cost: one read of the attribute; memory 4 bytes a point (none for rgb, whose stored column is mapped, and for one
+    colour, which is repeated with stride 0).
     """
     n = scene.info.n_stored
     match colouring.mode:
         case "rgb":
             return scene.attribute("rgb")
         case "constant":
-            return np.full(n, colouring.word, "<u4")
+            return np.broadcast_to(colouring.word, n)
         case "classification":
             palette = _class_palette()
             codes = scene.attribute("classification")

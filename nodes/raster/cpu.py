@@ -140,8 +140,11 @@ def _side_range(size: PointSize, camera: Camera) -> tuple[np.float32, np.float32
 
 
 def _read_only(column: np.ndarray) -> np.ndarray:
-    """A read-only view, so that memory-mapped and fresh arrays are one type to the compiler."""
-    view = np.ascontiguousarray(column).view()
+    """A read-only view, so that memory-mapped and fresh arrays are one type to the compiler.
+
+    A column of one repeated value (stride 0) stays one value in memory; the kernels are compiled for it apart.
+    """
+    view = column.view() if column.strides == (0,) else np.ascontiguousarray(column).view()
     view.flags.writeable = False
     return view
 

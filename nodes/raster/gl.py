@@ -125,7 +125,7 @@ class _GlRasterizer(ABC):
         self._chunk_first = chunk_first
         columns = (points.x, points.y, points.z, points.colour)
         self._chunks = [
-            [self._buffer(column[first : first + per_chunk]) for column in columns]
+            [self._buffer(np.ascontiguousarray(column[first : first + per_chunk])) for column in columns]
             for first in chunk_first
             if len(points)
         ]
