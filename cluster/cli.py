@@ -15,6 +15,7 @@ import typer
 
 from ..shared.compile_cache import ensure_compile_cache
 from ..shared.errors import InputError, SplatpipeError
+from ..shared.files import disk_error
 
 app = typer.Typer(
     name="splatpipe",
@@ -319,6 +320,9 @@ def main() -> None:
         _fail(error, f"out of memory: {error}", 1)
     except BrokenPipeError:
         os._exit(1)  # whoever read us has gone; nothing to say and nowhere to say it
+    except OSError as error:
+        told = disk_error(error, Path(error.filename or "output or compile cache"))
+        _fail(error, str(told), getattr(told, "exit_status", 1))
     except Exception as error:
         _fail(error, f"internal error: {type(error).__name__}: {error}; --debug shows where", 1)
 
