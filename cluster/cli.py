@@ -15,7 +15,7 @@ import typer
 
 from ..shared.compile_cache import ensure_compile_cache
 from ..shared.errors import InputError, SplatpipeError
-from ..shared.files import disk_error
+from ..shared.files import DISK_FULL
 
 app = typer.Typer(
     name="splatpipe",
@@ -321,8 +321,9 @@ def main() -> None:
     except BrokenPipeError:
         os._exit(1)  # whoever read us has gone; nothing to say and nowhere to say it
     except OSError as error:
-        told = disk_error(error, Path(error.filename or "output or compile cache"))
-        _fail(error, str(told), getattr(told, "exit_status", 1))
+        full = error.errno in DISK_FULL  # also where numba keeps what it compiled
+        where = error.filename or ("output or compile cache" if full else type(error).__name__)
+        _fail(error, f"{where}: {'disk full' if full else error.strerror or error}", 2 if full else 1)
     except Exception as error:
         _fail(error, f"internal error: {type(error).__name__}: {error}; --debug shows where", 1)
 

@@ -12,6 +12,10 @@ from typing import Any
 from .errors import InputError, SplatpipeError
 
 
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""Error numbers of a disk, quota or file-size limit that is used up."""
+
+
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:
     """Write a file under a hidden name and rename it, so that nothing half-written has the name.
 
@@ -29,7 +33,7 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
 def disk_error(error: BaseException, path: Path) -> BaseException:
     """The error a user can act on: a full or unwritable disk becomes InputError; anything else stays."""
     if isinstance(error, OSError) and not isinstance(error, SplatpipeError):
-        if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        if error.errno in DISK_FULL:
             return InputError(f"{path}: disk full")
         return InputError(f"{path}: cannot be written: {error.strerror or error}")
     return error
