@@ -16,7 +16,7 @@ import numpy as np
 from ..shared.errors import DeviceError
 from ..shared.files import disk_error, write_whole
 
-_PNG_LEVEL = 1  # files 10 % larger than level 6 and five times as fast: the encoder must not be the slowest stage
+PNG_LEVEL = 1  # files 10 % larger than level 6 and five times as fast: the encoder must not be the slowest stage
 
 
 class FrameSink:
@@ -73,7 +73,7 @@ class FrameSink:
             path = self.directory / frame_name(frame)
             opaque = bool((rgba[..., 3] == 255).all())
             image = Image.fromarray(rgba[..., :3] if opaque else rgba)
-            write_whole(path, lambda part: image.save(part, format="PNG", compress_level=_PNG_LEVEL))
+            write_whole(path, lambda part: image.save(part, format="PNG", compress_level=PNG_LEVEL))
             self.bytes_written += path.stat().st_size
             self.times["png_s"].append(time.perf_counter() - started)
         finally:

@@ -5,7 +5,6 @@ module         owns
 =============  ==========================================================================================
 ``config``     the TOML file: base run, scenes, sweeps; every point of every sweep as one configuration
 ``reference``  the frames that errors are measured against: every point, float64, kept on disk
-``order``      a scene rebuilt in the other point order, so that stride and layers meet the same points
 ``picture``    a frame as the bytes that leave the machine, and what those bytes show
 ``sweep``      the two passes: first time alone, then error alone
 ``report``     the table, the diagrams with their Pareto front, the omissions

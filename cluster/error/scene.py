@@ -1,0 +1,121 @@
+"""One scene of a sweep: its points in each order, the cameras, the reference frames, and the nodes of one point."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ...nodes.culling import CullingNode
+from ...nodes.raster import ResidentPoints
+from ...nodes.raster.choose import make_rasterizer
+from ...nodes.raster.fixed_point import fixed_point
+from ...nodes.render import RenderNode, load_points
+from ...nodes.sampling import SamplingNode
+from ...shared.camera import Camera
+from ...shared.messages import RenderPoints, VisibilityBits
+from ...shared.octree import Octree
+from ...shared.rebuild import rebuild_in_order
+from ...shared.store import Scene
+from ..job import Job
+from ..progress import FrameProgress
+from .config import ErrorConfig, SceneEntry, SweepPoint, base_config, sweep_points
+from .reference import References
+
+STAGES = ("culling", "sampling", "render")
+
+
+@dataclass(frozen=True)
+class Pipeline:
+    """Culling, sampling and render node of one point, called one after the other in this process."""
+
+    culling: CullingNode
+    sampling: SamplingNode
+    render: RenderNode
+
+    def draw(self, camera: Camera) -> tuple[VisibilityBits, RenderPoints, np.ndarray]:
+        """The messages of a frame, and its words, which are valid until the next call."""
+        bits = self.culling.process(camera)
+        chosen = self.sampling.process(camera, bits)
+        return bits, chosen, self.render.process(camera, chosen)
+
+    def timed_draw(self, camera: Camera) -> list[float]:
+        """Seconds of each of ``STAGES`` for one frame."""
+        started = time.perf_counter()
+        bits = self.culling.process(camera)
+        culled = time.perf_counter()
+        chosen = self.sampling.process(camera, bits)
+        sampled = time.perf_counter()
+        self.render.process(camera, chosen)
+        return [culled - started, sampled - culled, time.perf_counter() - sampled]
+
+
+@dataclass(frozen=True)
+class _Loaded:
+    """The scene in one point order, in memory."""
+
+    scene: Scene
+    octree: Octree
+    points: ResidentPoints
+
+
+class SweptScene:
+    """One scene and the points of the sweep on it.
+
+    Raises InputError for a scene that is missing or a setting that does not fit it.
+    """
+
+    def __init__(self, config: ErrorConfig, entry: SceneEntry, source: str) -> None:
+        self.name = entry.name
+        self.points = list(sweep_points(config, entry, source))
+        self._job = Job(base_config(config, entry, source))
+        self._folder = Path(self._job.output)
+        self._colouring = self._job.colouring.settled(self._job.scene)
+        self._loaded: dict[str, _Loaded] = {}
+        info = self._job.scene.info
+        self.n_points = info.n_points
+        self.radius = math.dist(info.lower, info.upper) / 2
+        self.background = self._job.background
+        self.cameras = [replace(self._job.camera(frame), frame=i) for i, frame in enumerate(config.frames)]
+
+    def order_of(self, point: SweepPoint) -> str:
+        """The point order that a point is drawn in."""
+        return self._job.scene.info.point_order if point.order == "as built" else point.order
+
+    def prepare(self, progress: FrameProgress) -> None:
+        """Load the scene in each order that a point needs; one in the other order is built first."""
+        own = self._job.scene
+        for order in {own.info.point_order, *map(self.order_of, self.points)}:
+            path = self._folder / "scenes" / f"{self.name}-{order}.scene"
+            scene = rebuild_in_order(own, order, path, progress.show)
+            points = load_points(scene, self._colouring, verify=self._job.config.scene.verify)
+            self._loaded[order] = _Loaded(scene, scene.octree(), points)
+
+    @contextmanager
+    def open(self, point: SweepPoint) -> Iterator[Pipeline]:
+        """The nodes of one point. Raises DeviceError where this machine cannot draw it."""
+        job, loaded = Job(point.config), self._loaded[self.order_of(point)]
+        points, bits = loaded.points, point.config.positions.bits_per_axis
+        if bits:
+            points = fixed_point(points, loaded.scene.info.edge, bits)
+        render, camera = point.config.render, point.config.camera
+        with make_rasterizer(
+            render.rasterizer, points, camera.width, camera.height, job.point_size, render.threads or None
+        ) as rasterizer:
+            yield Pipeline(job.culling_node(loaded.octree), job.sampling_node(loaded.octree), RenderNode(rasterizer))
+
+    def references(self, progress: FrameProgress) -> list[np.ndarray]:
+        """(height, width) uint64 words of the reference frame of each camera."""
+        loaded = self._loaded[self._job.scene.info.point_order]
+        kept = References(
+            self._folder / "references", loaded.scene, loaded.points, self._colouring, self._job.point_size
+        )
+        return [
+            kept.frame(camera, lambda done, i=i: progress.show(f"{self.name}: reference {i + 1}", done, self.n_points))
+            for i, camera in enumerate(self.cameras)
+        ]
