@@ -85,7 +85,7 @@ def measured_application(
                 "read_back_share": derived(1 if gpu else 0),
                 "read_backs": derived(1 if gpu else 0),
                 "vertices": measured(n_points, "the frame with most points"),
-                "vertex_bytes": measured(entries_bytes if gpu else 0, "points are resident, entries are sent"),
+                "vertex_bytes": measured(entries_bytes if gpu else 0, "entries; points stay on the GPU"),
                 "vertices_per_s": measured(found["render"]["vertices_per_s"]),
                 "fragments": derived(_fragments(job, octree, int(np.argmax(per_frame["points"])))),
                 "fragments_per_s": measured(found["render"]["fragments_per_s"]),

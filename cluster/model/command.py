@@ -13,7 +13,7 @@ from ..progress import FrameProgress
 from .application import instrumented_run, measured_application
 from .inequalities import Condition, conditions
 from .measure import measure_ranks, measured_system
-from .parameters import Application, System
+from .parameters import Application, System, is_frame_rate
 from .system_file import read_system_file, write_system_file
 
 
@@ -49,7 +49,7 @@ def make_model(
     """
     if inside_mpi():
         raise InputError("splatpipe model: found a rank of mpiexec, expected to be started without: it starts its own")
-    if frames_per_s is not None and not 0 < frames_per_s < float("inf"):
+    if frames_per_s is not None and not is_frame_rate(frames_per_s):
         raise InputError(f"--fps {frames_per_s}: expected a finite number > 0")
     filed, application = read_system_file(system_path) if system_path else (None, None)
     run: dict[str, Any] = {}

@@ -40,7 +40,8 @@ class Need:
 
     def largest_data(self, frames_per_s: float) -> float:
         """Data a frame that would just be in time; 0 where the latencies alone take longer."""
-        return max(0.0, 1 / frames_per_s - self.count * self.latency_s) * self.rate_per_s
+        left_s = 1 / frames_per_s - self.count * self.latency_s
+        return left_s * self.rate_per_s if left_s > 0 and self.rate_per_s > 0 else 0.0
 
     @property
     def _transfer_s(self) -> float:

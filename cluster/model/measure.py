@@ -85,17 +85,19 @@ def measured_system(found: dict[str, Any], roles: list[str]) -> System:
             values[name] = measured(value, machine["notes"].get(name, ""))
         gpu = found["render"]["gpu"] if role in ("render", "single") else {}
         for name in (name for name in values if name.startswith(("gpu_", "video_"))):
-            values[name] = _rate(gpu.get(name)) if gpu else NOT_APPLICABLE
+            values[name] = _or_unknown(gpu.get(name)) if gpu else NOT_APPLICABLE
         ranks.append(RankSystem(role, **values))
     links = []
     for link in found["links"]:
-        names = [item.name for item in parameters(Link)]
-        links.append(Link(link["sender"], link["receiver"], **{name: _rate(link[name]) for name in names}))
+        off = {kind: f"a sample is {share:.0%} off the line" for kind, share in link["worst_residual"].items()}
+        notes = {"latency_s": off["raw"], "bytes_per_s": off["raw"], "polite_bytes_per_s": off["polite"]}
+        values = {item.name: _or_unknown(link[item.name], notes.get(item.name, "")) for item in parameters(Link)}
+        links.append(Link(link["sender"], link["receiver"], **values))
     return System(tuple(ranks), tuple(links))
 
 
-def _rate(value: float | None) -> Quantity:
-    return UNKNOWN if value is None else measured(value)
+def _or_unknown(value: float | None, note: str = "") -> Quantity:
+    return UNKNOWN if value is None else measured(value, note)
 
 
 def _machine() -> dict[str, Any]:

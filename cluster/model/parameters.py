@@ -7,6 +7,7 @@ made from them.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import Field, dataclass, field, fields
 from enum import StrEnum
@@ -133,6 +134,11 @@ class Traffic:
     receiver: int
     messages: Quantity = _parameter("N_e", "1/frame", "messages")
     bytes: Quantity = _parameter("D_e", "bytes/frame", "data, headers included")
+
+
+def is_frame_rate(value: float) -> bool:
+    """Whether a frame rate and the time of a frame are both finite and above 0."""
+    return 0 < value < math.inf and 1 / value < math.inf
 
 
 @dataclass(frozen=True)

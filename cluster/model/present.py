@@ -120,13 +120,13 @@ def _bottleneck_text(model: Model) -> str:
 
 
 def _parameter_table(parts: Sequence[Any], names: Sequence[str]) -> tuple[list[str], list[list[Any]]]:
-    """Columns and rows: a parameter a row; equal columns stand for themselves, sources follow the values."""
+    """Columns and rows: one parameter a row, its values, and where they come from."""
     columns = ["symbol", "meaning", "unit", *names, "source"]
     rows = []
     for item in parameters(parts[0]):
         quantities: list[Quantity] = [getattr(part, item.name) for part in parts]
-        said = {f"{q.source}{f' ({q.note})' if q.note else ''}" for q in quantities if q.value is not None}
-        said |= {str(q.source) for q in quantities if q.value is None and not said}
+        telling = [q for q in quantities if q.value] or quantities  # a 0 beside other values says nothing
+        said = {f"{q.source} ({q.note})" if q.note else str(q.source) for q in telling}
         values = [q.value for q in quantities]
         rows.append(
             [item.metadata["symbol"], item.metadata["meaning"], item.metadata["unit"], *values, "; ".join(sorted(said))]

@@ -15,6 +15,7 @@ from numba import njit
 
 from ...nodes.raster import PointSize, ResidentPoints
 from ...nodes.raster.choose import make_rasterizer
+from ...shared.build.settings import available_memory_bytes
 from ...shared.camera import Camera
 from ...shared.messages import RENDER_POINT
 
@@ -42,8 +43,8 @@ def cpu_flop_per_s(dtype: type[np.floating]) -> float:
 
 
 def uncached_bytes() -> int:
-    """Working set of the uncached probes: twice the last-level cache, within 512 MiB and an eighth of the memory."""
-    return min(max(2 * cache_bytes(), 64 << 20), _MOST_UNCACHED_BYTES, memory_bytes() // 8)
+    """Working set of the uncached probes: twice the last-level cache, within 512 MiB and a quarter of what is free."""
+    return min(max(2 * cache_bytes(), 64 << 20), _MOST_UNCACHED_BYTES, available_memory_bytes() // 4)
 
 
 def memory_latency_s(working_set_bytes: int) -> float:

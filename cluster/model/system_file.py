@@ -14,7 +14,18 @@ from typing import Any, TypeVar
 
 from ...shared.errors import InputError
 from ...shared.files import write_whole
-from .parameters import Application, Link, Quantity, RankLoad, RankSystem, Source, System, Traffic, parameters
+from .parameters import (
+    Application,
+    Link,
+    Quantity,
+    RankLoad,
+    RankSystem,
+    Source,
+    System,
+    Traffic,
+    is_frame_rate,
+    parameters,
+)
 
 VERSION = 1
 _ABSENT = (Source.NOT_APPLICABLE, Source.UNKNOWN)
@@ -47,8 +58,8 @@ def read_system_file(path: Path) -> tuple[System, Application | None]:
     if "application" in data:
         table = reader.table(data, "application", ("frames_per_s", "rank", "traffic"))
         frames_per_s = reader.number(table, "application.frames_per_s")
-        if not frames_per_s:
-            raise reader.wrong("application.frames_per_s", 0, "a number > 0")
+        if not is_frame_rate(frames_per_s):
+            raise reader.wrong("application.frames_per_s", frames_per_s, "a number > 0")
         loads = reader.parts(RankLoad, table, "application.rank", 0)
         if len(loads) != len(ranks):
             raise reader.wrong("application.rank", f"{len(loads)} ranks", f"{len(ranks)} as in system.rank")

@@ -16,6 +16,7 @@ from ..report import Report, as_text
 MODULES = (
     "splatpipe.shared.stability.eigenvalues",
     "splatpipe.nodes.stability.projection",
+    "splatpipe.cluster.stability.inequalities",
 )
 COLUMNS = ("case", "what", "value", "bound", "unit", "verdict")
 
