@@ -156,16 +156,17 @@ def experiment(
 def plan(
     config: Annotated[Path, typer.Argument(help="Configuration of a run.")],
     sets: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a key.")] = None,
+    measure: Annotated[bool, typer.Option("--measure", help="Time each part against the run without it.")] = False,
     report: Annotated[Path | None, typer.Option(metavar="STEM", help="Write STEM.html and STEM.md.")] = None,
     json: JsonOption = None,
 ) -> None:
-    """Say what a run needs, what it leaves out and why, and what that gains. Draws nothing.
+    """Say what a run needs, what it leaves out and why, and what that gains.
 
-    Example: `splatpipe plan city.toml --report plan`
+    Example: `splatpipe plan city.toml --measure --report plan`
     """
     from .plan.command import plan_command, print_plan, report_plan
 
-    results = plan_command(config, sets or [])
+    results = plan_command(config, sets or [], measure=measure)
     _report(results, print_plan, json)
     if report is not None:
         report_plan(results, report)
@@ -243,6 +244,35 @@ def stability(
     from .stability.suite import stability_command
 
     raise typer.Exit(stability_command(only, json, report))
+
+
+@app.command()
+def predict(
+    config: Annotated[Path, typer.Argument(help="Configuration of a run; with --validate an experiment file.")],
+    sets: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a key.")] = None,
+    what_if: Annotated[
+        list[str] | None,
+        typer.Option(metavar="KEY=VALUE", help="A key of the run, or cores, bandwidth, latency, speed, points."),
+    ] = None,
+    ranks: Annotated[int, typer.Option(help="On paper, up to this many ranks.", min=3, max=1 << 16)] = 4096,
+    repeats: Annotated[int, typer.Option(help="Runs of each calibration setting.", min=1)] = 3,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Calibration runs and report.")] = Path("predicted"),
+    validate: Annotated[
+        bool, typer.Option("--validate", help="Predicted beside measured, over an experiment.")
+    ] = False,
+    fresh: Annotated[bool, typer.Option("--fresh", help="Measure again instead of using what is there.")] = False,
+    json: JsonOption = None,
+) -> None:
+    """Frames/s, latency and bottleneck of other settings, cores and ranks, from costs fitted on a few measured runs.
+
+    Example: `splatpipe predict configs/demo.toml --what-if cores=16 --what-if camera.width=3840`
+    """
+    from .predict.command import predict_command, validate_command
+
+    if validate:
+        validate_command(config, fresh=fresh, json_path=json)
+    else:
+        predict_command(config, sets or [], what_if or [], ranks, repeats, output, fresh=fresh, json_path=json)
 
 
 @bench_app.command("raster")

@@ -186,4 +186,5 @@ def _tell(summary: dict[str, Any]) -> None:
     if summary["left_out"]:
         console.print("left out, because this run does not need it:")
     for item in summary["left_out"]:
-        console.print(f"  {item['what']}: {item['why']}")
+        saved = "" if item["gain"] is None else f" ({item['gain']:.3g} {item['unit']})"
+        console.print(f"  {item['what']}: {item['why']}{saved}")

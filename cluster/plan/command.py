@@ -11,22 +11,35 @@ from ...shared.config import load_config
 from ..job import Job
 from ..record import machine_record
 from ..report import Report, as_text
+from .ablation import Ablation, ablate
 from .needs import parts
 from .topology import decide
+from .whole_runs import ablate_runs, import_times
 from .workload import Workload
 
 
-def plan_command(config_path: Path, overrides: list[str]) -> dict[str, Any]:
-    """The plan of a run, JSON-able. Nothing is drawn. Raises InputError for a wrong configuration or scene."""
+def plan_command(config_path: Path, overrides: list[str], *, measure: bool = False) -> dict[str, Any]:
+    """The plan of a run, JSON-able.
+
+    measure : put parts back and time them, in this process and in whole runs; some ten seconds. Else nothing is drawn.
+    Raises InputError for a wrong configuration or scene.
+    """
     job = Job(load_config(config_path, overrides))
     decision = decide(job)
     work = Workload.of_look(job)
+    measured: list[Ablation] = []
+    imports: list[dict[str, Any]] = []
+    if measure:
+        measured = [*ablate(job), *ablate_runs(job, config_path, overrides)]
+        imports = import_times()
     return {
         "config": str(config_path),
         "overrides": overrides,
         "plan": asdict(decision),
         "workload": asdict(work),
         "parts": [asdict(part) for part in parts(job, work, decision)],
+        "ablation": [asdict(ablation) for ablation in measured],
+        "imports": imports,
         "machine": machine_record(),
     }
 
@@ -64,7 +77,21 @@ def tables(results: dict[str, Any]) -> list[tuple[str, list[str], list[list[Any]
         held: [[part[key] for key in ("what", *columns[1:])] for part in results["parts"] if part["left_out"] == held]
         for held in (True, False)
     }
-    return [
+    found = [
         ("Left out", columns, rows[True]),
         ("Kept, and what leaving it out would save", columns, rows[False]),
     ]
+    if results["ablation"]:
+        columns = ["part", "without, ms", "with, ms", "saved, ms", "of", "pairs", "error added"]
+        found.append(("Ablation: medians, in turn", columns, [_ablation_row(row) for row in results["ablation"]]))
+    if results["imports"]:
+        import_rows = [[row["part"], row["module"], row["ms"]["median"]] for row in results["imports"]]
+        found.append(("Imports, each in a fresh process", ["part", "module", "ms"], import_rows))
+    return found
+
+
+def _ablation_row(row: dict[str, Any]) -> list[Any]:
+    without, with_part = (row[key]["median"] for key in ("without_ms", "with_ms"))
+    of = "a run" if row["once"] else "a frame"
+    error = "0: the same bits" if row["identical"] else "NOT the same bits"
+    return [row["part"], without, with_part, row["saved_ms"], of, row["repeats"], error]

@@ -11,6 +11,11 @@ from ..job import Job
 from .topology import COSTS, Decision
 from .workload import Workload
 
+MPI, OPENGL, PNG, FILM = "MPI", "OpenGL", "PNG encoding", "film encoding"
+NO_NORMALS, BACK_FACE = "normals and back-face test", "back-face test"
+LEVEL_OF_DETAIL, SPLAT_LOOP = "level of detail", "splat loop and attenuation"
+COLOUR, COLOUR_MAPS, CHECKSUMS = "colour column", "colour maps", "checksums"
+
 _COLOUR_MAPPED = ("intensity", "elevation", "level")
 
 
@@ -51,8 +56,8 @@ def parts(job: Job, work: Workload, decision: Decision) -> list[Part]:
         _checksums(job),
         _opengl(job),
         _colour_maps(job),
-        _encoding(job, work, "PNG encoding", "output.png", job.config.output.png, COSTS.png_s),
-        _encoding(job, work, "film encoding", "output.mp4", job.config.output.mp4, COSTS.mp4_s),
+        _encoding(job, work, PNG, "output.png", job.config.output.png, COSTS.png_s),
+        _encoding(job, work, FILM, "output.mp4", job.config.output.mp4, COSTS.mp4_s),
     ]
 
 
@@ -68,7 +73,7 @@ def _mpi(work: Workload, decision: Decision) -> Part:
     single = decision.topology == "single"
     if not single and decision.estimate is not None:
         gain_s = -gain_s
-    return Part("MPI", single, decision.reason, gain_s * 1e3, "ms/frame")
+    return Part(MPI, single, decision.reason, gain_s * 1e3, "ms/frame")
 
 
 def _compositing(work: Workload) -> Part:
@@ -79,22 +84,22 @@ def _compositing(work: Workload) -> Part:
 def _back_face_test(job: Job, work: Workload) -> Part:
     cost_ms = COSTS.back_face_s * work.cells_visible * 1e3
     if "normal" not in job.scene.info.attributes:
-        return Part("normals and back-face test", True, "the scene has no normals", cost_ms, "ms/frame")
+        return Part(NO_NORMALS, True, "the scene has no normals", cost_ms, "ms/frame")
     if not job.backface:
-        return Part("back-face test", True, "culling.backface is false", cost_ms, "ms/frame")
-    return Part("back-face test", False, "culling.backface is true: closed surfaces", cost_ms, "ms/frame")
+        return Part(BACK_FACE, True, "culling.backface is false", cost_ms, "ms/frame")
+    return Part(BACK_FACE, False, "culling.backface is true: closed surfaces", cost_ms, "ms/frame")
 
 
 def _level_of_detail(job: Job, work: Workload) -> Part:
     cost_ms = COSTS.lod_s * work.cells_visible * 1e3
     if work.cells == 1:
-        return Part("level of detail", True, "one cell: there is nothing to choose between", cost_ms, "ms/frame")
+        return Part(LEVEL_OF_DETAIL, True, "one cell: there is nothing to choose between", cost_ms, "ms/frame")
     if job.pixel_threshold == 0:
         why = "sampling.pixel_threshold = 0: every point is drawn"
-        return Part("level of detail", True, why, cost_ms, "ms/frame")
+        return Part(LEVEL_OF_DETAIL, True, why, cost_ms, "ms/frame")
     share = 1 - work.points / job.scene.info.n_points
     why = f"sampling.pixel_threshold = {job.pixel_threshold:g}: with culling it spares {share:.0%} of the points"
-    return Part("level of detail", False, why, cost_ms, "ms/frame")
+    return Part(LEVEL_OF_DETAIL, False, why, cost_ms, "ms/frame")
 
 
 def _render_point_stride(job: Job, work: Workload) -> Part:
@@ -109,18 +114,16 @@ def _splat_loop(job: Job, work: Workload) -> Part:
     cost_ms = (COSTS.square_s - COSTS.point_s) * work.points * 1e3
     if job.largest_point_px == 1:
         why = "points are one pixel: the kernel without sizes and inner loop is used"
-        return Part("splat loop and attenuation", True, why, cost_ms, "ms/frame")
+        return Part(SPLAT_LOOP, True, why, cost_ms, "ms/frame")
     why = f"points are up to {job.largest_point_px} px wide"
-    return Part("splat loop and attenuation", False, why, cost_ms, "ms/frame")
+    return Part(SPLAT_LOOP, False, why, cost_ms, "ms/frame")
 
 
 def _colour(job: Job) -> Part:
     column_mb = 4e-6 * job.scene.info.n_stored
     if job.colouring.mode == "constant":
-        return Part("colour column", True, "one colour for every point", column_mb, "MB resident", "counted")
-    return Part(
-        "colour column", False, f"points differ in colour ({job.colouring.mode})", column_mb, "MB resident", "counted"
-    )
+        return Part(COLOUR, True, "one colour for every point", column_mb, "MB resident", "counted")
+    return Part(COLOUR, False, f"points differ in colour ({job.colouring.mode})", column_mb, "MB resident", "counted")
 
 
 def _attributes(job: Job) -> list[Part]:
@@ -149,21 +152,21 @@ def _checksums(job: Job) -> Part:
     info = job.scene.info
     cost_s = COSTS.checksum_s * (12 * info.n_stored + sum(info.arrays[f"attr_{n}"].bytes for n in job.attributes_read))
     if job.config.scene.verify:
-        return Part("checksums", False, "scene.verify is true: damage is named, not drawn", cost_s, "s of loading")
-    return Part("checksums", True, "scene.verify is false", cost_s, "s of loading")
+        return Part(CHECKSUMS, False, "scene.verify is true: damage is named, not drawn", cost_s, "s of loading")
+    return Part(CHECKSUMS, True, "scene.verify is false", cost_s, "s of loading")
 
 
 def _opengl(job: Job) -> Part:
     rasterizer = resolve_rasterizer(job.config.render.rasterizer)
     cpu = rasterizer == "cpu"
     why = "rasterizer cpu: no import, context or shader" if cpu else f"rasterizer {rasterizer}"
-    return Part("OpenGL", cpu, why, COSTS.opengl_s, "s of starting")
+    return Part(OPENGL, cpu, why, COSTS.opengl_s, "s of starting")
 
 
 def _colour_maps(job: Job) -> Part:
     mapped = job.colouring.mode in _COLOUR_MAPPED
     why = f"colour {job.colouring.mode} " + ("goes through one" if mapped else "needs none: matplotlib is not imported")
-    return Part("colour maps", not mapped, why, COSTS.colour_maps_s, "s of starting")
+    return Part(COLOUR_MAPS, not mapped, why, COSTS.colour_maps_s, "s of starting")
 
 
 def _encoding(job: Job, work: Workload, what: str, key: str, wanted: bool, unit_s: float) -> Part:

@@ -29,15 +29,15 @@ class UnitCosts:
     and culling and sampling are timed where the run starts.
     """
 
-    point_s: float = 7e-9
-    square_s: float = 12e-9
-    pixel_s: float = 4e-9
+    point_s: float = 4e-9
+    square_s: float = 13e-9
+    pixel_s: float = 1.5e-9
     gl_point_s: float = 0.5e-9
     picture_s: float = 3e-9
     png_s: float = 25e-9
     mp4_s: float = 25e-9
-    message_s: float = 0.4e-3
-    start_s: float = 1.0
+    message_s: float = 0.5e-3
+    start_s: float = 2.0
     back_face_s: float = 5e-9
     lod_s: float = 5e-9
     flatness_s: float = 30e-9
