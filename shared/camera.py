@@ -88,15 +88,23 @@ def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
     Raises InputError if eye and target coincide.
     """
     eye, target, up = (np.asarray(v, np.float64) for v in (eye, target, up))
-    axis = target - eye
-    length = np.linalg.norm(axis)
-    if not length > 0:
+    if np.array_equal(eye, target):
         raise InputError(f"camera: eye and target coincide at {eye.tolist()}")
-    axis = axis / length
+    axis, up = _unit(target - eye), _unit(up)
     right = np.cross(axis, up)
-    if np.linalg.norm(right) < 1e-9 * max(np.linalg.norm(up), 1e-300):
+    if np.linalg.norm(right) < 1e-9:
         right = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    right = right / np.linalg.norm(right)
+    right = _unit(right)
+    right = _unit(right - (right @ axis) * axis)  # what a short cross product has lost to rounding
     pose = np.eye(4)
     pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = right, np.cross(right, axis), -axis, eye
     return pose
+
+
+def _unit(vector: np.ndarray) -> np.ndarray:
+    """A (3,) vector of length one in this direction, however long or short; zero stays zero."""
+    largest = np.abs(vector).max()
+    if largest == 0:
+        return vector
+    vector = vector / largest
+    return vector / np.linalg.norm(vector)
