@@ -18,6 +18,8 @@ from .parallel import Workers
 
 _EDGE_BITS = 12
 _LAST = (1 << MAX_LEVEL) - 1
+_MAX_EXTENT = 1e30
+"""World units: stored offsets and their products with a focal length stay within float32."""
 
 
 def root_cube(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, float]:
@@ -25,12 +27,12 @@ def root_cube(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, float]:
 
     The edge has 12 significant bits (it grows by less than 0.05 %), so that cell centres of a scene moved by an exact
     translation are exact too, and float32 offsets from them do not change.
-    Raises InputError if an extent is not finite in float64.
+    Raises InputError for an extent above 1e30.
     """
     with np.errstate(over="ignore"):
         extent = float(np.max(upper - lower))
-    if not math.isfinite(extent):
-        raise InputError(f"bounds: found an extent of {extent}, expected a finite one")
+    if not extent <= _MAX_EXTENT:
+        raise InputError(f"bounds: found an extent of {extent:g}, expected at most {_MAX_EXTENT:g}")
     largest = float(np.max(np.abs([lower, upper])))
     if extent == 0.0:
         extent = max(1.0, float(np.spacing(largest)) * 2**MAX_LEVEL)
