@@ -14,8 +14,15 @@ from ..record import machine_record
 from ..report import Report, as_text
 
 MODULES = (
-    "splatpipe.shared.stability.eigenvalues",
     "splatpipe.nodes.stability.projection",
+    "splatpipe.nodes.stability.extents",
+    "splatpipe.nodes.stability.depth",
+    "splatpipe.nodes.stability.clouds",
+    "splatpipe.nodes.stability.viewports",
+    "splatpipe.nodes.stability.large",
+    "splatpipe.shared.stability.eigenvalues",
+    "splatpipe.shared.stability.cameras",
+    "splatpipe.shared.stability.grids",
     "splatpipe.cluster.stability.inequalities",
 )
 COLUMNS = ("case", "what", "value", "bound", "unit", "verdict")

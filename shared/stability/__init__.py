@@ -4,13 +4,12 @@ The suite is the cases of three packages, each beside what it tests: ``shared.st
 ``nodes.stability`` (scenes built, culled, sampled and drawn) and ``cluster.stability`` (messages, models, and the
 command that runs them all). A module adds a case by defining one; ``cluster.stability.suite`` names the modules.
 
-==============  ==============================================================
-module          owns
-==============  ==============================================================
-``case``        what a case is, how it is run, its verdict
-``eigenvalues`` flatness of a cell against 50 digits
-``camera_maths``  matrices and poses against 50 digits and against orthonormality
-``key_paths``   interpolation at antipodal, equal and close keys
-``octree_maths``  keys, centres and normals at the ends of their ranges
-==============  ==============================================================
+===============  ============================================================
+module           owns
+===============  ============================================================
+``case``         what a case is, how it is run, its verdict
+``eigenvalues``  flatness of a cell against 50 digits
+``cameras``      matrices and poses against 50 digits; keyframe paths
+``grids``        keys, centres and normals against integers and rationals
+===============  ============================================================
 """
