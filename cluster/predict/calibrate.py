@@ -1,0 +1,110 @@
+"""Which runs the costs are fitted on, and how they are made: as points of an experiment, so resumable and interleaved.
+
+No calibration run has the settings of the run that is predicted: other pixel thresholds, another resolution.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from ...shared.config import RunConfig, load_config, parse_config
+from ..experiment.config import ExperimentConfig, ExperimentSection
+from ..experiment.grid import Experiment, Point
+from ..experiment.journal import Journal
+from ..job import Job
+from ..launch import mpi_available
+from .costs import Costs, Measured, fit_costs
+from .forecast import Machine, fit_messages
+from .workload import Workload, count_workload
+
+THRESHOLDS_PX = (4.0, 16.0)
+"""Of the calibration of a run that draws every point (threshold 0); of others half and double theirs."""
+
+
+def calibration_points(run: RunConfig) -> list[Point]:
+    """The settings to measure for the costs of a run.
+
+    On one rank two thresholds and half the resolution; both thresholds with all cores; three ranks where there is MPI.
+    """
+    threshold = run.sampling.pixel_threshold
+    fine, coarse = (threshold / 2, threshold * 2) if threshold else THRESHOLDS_PX
+    size = (run.camera.width, run.camera.height)
+    half = (max(size[0] // 2, 16), max(size[1] // 2, 16))
+    cores = len(os.sched_getaffinity(0))
+    wanted = [("single", 1, fine, size), ("single", 1, coarse, size), ("single", 1, fine, half)]
+    if cores > 1:
+        wanted += [("single", cores, fine, size), ("single", cores, coarse, size)]
+    if mpi_available():
+        wanted += [("pipelined", threads, coarse, size) for threads in dict.fromkeys((1, cores))]
+    return [
+        {
+            "pipeline.topology": topology,
+            "render.threads": threads,
+            "sampling.pixel_threshold": min(pixels, 4096.0),
+            "camera.width": width,
+            "camera.height": height,
+        }
+        for topology, threads, pixels, (width, height) in wanted
+    ]
+
+
+def with_point(run: RunConfig, point: Point) -> RunConfig:
+    """The run with a point's settings."""
+    tables: dict[str, Any] = run.model_dump(mode="json", exclude_none=True)
+    for key, value in point.items():
+        section, _, name = key.partition(".")
+        tables[section][name] = value
+    return parse_config(tables)
+
+
+def calibration_experiment(base: Path, overrides: list[str], output: Path, repeats: int) -> Experiment:
+    """The calibration of one run configuration as an experiment of its own."""
+    run = load_config(base, overrides)
+    whole: dict[str, Any] = run.model_dump(mode="json", exclude_none=True)
+    common = {f"{section}.{key}": value for section, table in whole.items() for key, value in table.items()}
+    for key in ("output.directory", "output.png", "output.mp4"):
+        del common[key]
+    common["scene.path"] = os.path.abspath(run.scene.path)
+    points = calibration_points(run)
+    settings = ExperimentSection(base=str(base), output=str(output), repeats=repeats, title="Calibration")
+    config = ExperimentConfig(experiment=settings, set=common)
+    return Experiment(config, base, base, output, points, [with_point(run, point) for point in points])
+
+
+def extended(experiment: Experiment) -> Experiment:
+    """The experiment followed by the calibration points of each of its scenes that it does not hold itself."""
+    points, runs = list(experiment.points), list(experiment.runs)
+    for path in dict.fromkeys(run.scene.path for run in experiment.runs):
+        i = next(i for i, run in enumerate(experiment.runs) if run.scene.path == path)
+        for point in calibration_points(experiment.runs[i]):
+            run = with_point(experiment.runs[i], point)
+            if run not in runs:
+                points.append(experiment.points[i] | point)
+                runs.append(run)
+    return replace(experiment, points=points, runs=runs)
+
+
+def measured_points(experiment: Experiment, journal: Journal) -> dict[int, Measured]:
+    """Point → what was measured there; points that never succeeded are missing."""
+    records: dict[int, list[dict[str, Any]]] = {}
+    for run in journal.runs:
+        if run.record is not None:
+            records.setdefault(run.point, []).append(run.record)
+    loads: dict[str, Workload] = {}
+    out = {}
+    for i, done in sorted(records.items()):
+        run = experiment.runs[i]
+        key = run.model_dump_json(exclude={"pipeline": True, "render": {"threads"}, "output": {"directory"}})
+        if key not in loads:
+            loads[key] = count_workload(Job(run))
+        out[i] = Measured(run, loads[key], done)
+    return out
+
+
+def all_costs(runs: Sequence[Measured], machine: Machine) -> Costs:
+    """Stages, contention and messages from calibration runs."""
+    return fit_messages(fit_costs(runs), runs, machine)

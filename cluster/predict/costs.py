@@ -1,0 +1,166 @@
+"""Seconds a cell, an entry, a point, a pixel: fitted from measured runs by non-negative least squares.
+
+Model of one frame's work, alone on the machine with one thread:
+
+    culling  = a + b · cells + c · visible cells
+    sampling = a + b · cells + c · visible cells + d · entries
+    render   = a + b · entries + c · points + d · covered pixels + e · merged pixels
+
+With t threads the render node uses u ≤ t framebuffers (``framebuffers_used``): points and covered pixels are divided
+by u, merged pixels are pixels · u / t. What the threads lose to each other (memory bandwidth, shared cores of a core
+pair) is one figure, ``contention``: the slow-down of each by every other that is busy.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...nodes.raster.cpu import MERGED_PIXELS_PER_POINT
+from ...shared.config import RunConfig
+from ...shared.errors import InputError
+from .workload import Workload, threads_of
+
+STAGES = ("culling", "sampling", "render")
+Columns = dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class StageCost:
+    """Fitted cost of one stage.
+
+    seconds : feature → seconds for one of it, ≥ 0.
+    residual : root mean square of (fitted − measured) / the run's mean, over the frames it was fitted on.
+    """
+
+    seconds: dict[str, float]
+    residual: float
+
+    def of(self, columns: Columns) -> np.ndarray:
+        """(n_frames,) seconds of work."""
+        return np.asarray(sum(self.seconds[name] * column for name, column in columns.items()), np.float64)
+
+
+@dataclass(frozen=True)
+class Costs:
+    """What everything costs on the measured machine.
+
+    stages : cost of culling, sampling and render on one thread with nothing beside it.
+    loop_s : seconds a frame outside the stages: camera, statistics, progress.
+    message_s : software latency: seconds a rank is busy, or late, for each message it sends or receives.
+    contention : slow-down of a busy core by each other busy core, ≥ 0.
+    """
+
+    stages: dict[str, StageCost]
+    loop_s: float
+    message_s: float
+    contention: float
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One setting that was measured: its configuration, what its frames had, and the records of its repeats."""
+
+    config: RunConfig
+    load: Workload
+    records: Sequence[dict[str, Any]]
+
+    @property
+    def topology(self) -> str:
+        """As it ran, which for ``auto`` the record knows."""
+        return self.records[0]["topology"]
+
+    @property
+    def threads(self) -> int:
+        """Threads of the render rank."""
+        return threads_of(self.config.render.threads)
+
+    @property
+    def frame_s(self) -> float:
+        """Seconds a frame of the whole run: median over the repeats."""
+        return float(np.median([1 / record["frames_per_s"] for record in self.records]))
+
+    def stage_s(self, stage: str) -> np.ndarray:
+        """(n_frames,) seconds of work of each frame: median over the repeats, so that what disturbed one is not in."""
+        return np.median([record["per_frame"][f"{stage}_s"] for record in self.records], axis=0)
+
+
+def stage_columns(load: Workload, threads: int) -> dict[str, Columns]:
+    """Stage → feature → (n_frames,) how much of it each frame has for the thread that has most to do."""
+    one = np.ones(load.n_frames)
+    used = framebuffers_used(load, threads)
+    return {
+        "culling": {"frame": one, "cell": one * load.cells, "visible cell": load.cells_visible},
+        "sampling": {
+            "frame": one,
+            "cell": one * load.cells,
+            "visible cell": load.cells_visible,
+            "entry": load.entries,
+        },
+        "render": {
+            "frame": one,
+            "entry": load.entries,
+            "point": load.points / used,
+            "covered pixel": (load.covered - load.points) / used,
+            "merged pixel": load.pixels * used / threads,
+        },
+    }
+
+
+def framebuffers_used(load: Workload, threads: int) -> np.ndarray:
+    """(n_frames,) framebuffers that the cpu rasterizer draws into: as many as make the frame shortest."""
+    best = np.rint(np.sqrt(MERGED_PIXELS_PER_POINT * load.points * threads / load.pixels))
+    return np.clip(best, 1, threads)
+
+
+def fit_costs(runs: Sequence[Measured]) -> Costs:
+    """Costs from runs on one rank; contention from those with several threads. ``message_s`` is 0.
+
+    Raises InputError if no run is ``single`` with one thread.
+    """
+    alone = [run for run in runs if run.topology == "single" and run.threads == 1]
+    if not alone:
+        raise InputError("costs: found no run of topology single with one thread, expected at least one")
+    columns = [stage_columns(run.load, 1) for run in alone]
+    stages = {
+        stage: fit_stage([of_run[stage] for of_run in columns], [run.stage_s(stage) for run in alone])
+        for stage in STAGES
+    }
+    loop = [run.frame_s - sum(float(run.stage_s(stage).mean()) for stage in STAGES) for run in alone]
+    return Costs(stages, max(float(np.median(loop)), 0.0), 0.0, _contention(stages["render"], runs))
+
+
+def fit_stage(columns: Sequence[Columns], seconds: Sequence[np.ndarray]) -> StageCost:
+    """Non-negative least squares over the frames of all runs, each run weighted by the inverse of its mean.
+
+    Weights by run and not by frame keep the fitted mean at the measured mean. Columns are scaled to a norm of 1.
+    Source: Lawson, Hanson, "Solving Least Squares Problems", 1974, chapter 23.
+    """
+    from scipy.optimize import nnls
+
+    names = list(columns[0])
+    weights = [1 / max(float(s.mean()), 1e-12) for s in seconds]
+    a = np.concatenate(
+        [np.column_stack([of_run[n] for n in names]) * w for of_run, w in zip(columns, weights, strict=True)]
+    )
+    b = np.concatenate([s * w for s, w in zip(seconds, weights, strict=True)])
+    norm = np.linalg.norm(a, axis=0)
+    norm[norm == 0] = 1.0
+    solution, _ = nnls(a / norm, b)
+    residual = math.sqrt(float(np.mean((a / norm @ solution - b) ** 2)))
+    return StageCost(dict(zip(names, (solution / norm).tolist(), strict=True)), residual)
+
+
+def _contention(render: StageCost, runs: Sequence[Measured]) -> float:
+    """Slow-down by each further busy thread: median over the runs on one rank with several."""
+    found = []
+    for run in runs:
+        used = float(framebuffers_used(run.load, run.threads).mean())
+        if run.topology == "single" and used > 1:
+            ideal = float(render.of(stage_columns(run.load, run.threads)["render"]).mean())
+            found.append((float(run.stage_s("render").mean()) / ideal - 1) / (used - 1))
+    return max(float(np.median(found)), 0.0) if found else 0.0

@@ -1,0 +1,61 @@
+"""Predicted beside measured frames/s, on runs that the costs were not fitted on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..experiment.grid import Experiment, Point
+from .calibrate import all_costs
+from .costs import Costs, Measured
+from .forecast import Forecast, Machine, Setting, forecast
+
+MEDIAN_GOAL, WORST_GOAL = 0.15, 0.30
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One point of the experiment.
+
+    measured : frames/s of each repeat.
+    """
+
+    point: Point
+    measured: list[float]
+    predicted: Forecast
+
+    @property
+    def error(self) -> float:
+        """(predicted − measured) / measured, of the median."""
+        return self.predicted.frames_per_s / float(np.median(self.measured)) - 1
+
+
+def compare(
+    experiment: Experiment, measured: dict[int, Measured], n_points: int, machine: Machine
+) -> tuple[list[Comparison], dict[str, Costs]]:
+    """Every one of the first ``n_points`` points against the costs of its scene; the costs by scene.
+
+    The others are calibration. A calibration run whose settings are those of a compared point is not used for it.
+    """
+    costs: dict[str, Costs] = {}
+    out = []
+    for i in range(n_points):
+        if i not in measured:
+            continue
+        run = measured[i]
+        scene = run.config.scene.path
+        if scene not in costs:
+            others = [m for j, m in measured.items() if j >= n_points and m.config.scene.path == scene]
+            costs[scene] = all_costs(others, machine)
+        setting = Setting(run.topology, run.threads, run.config.pipeline.frames_in_flight)
+        rates = [record["frames_per_s"] for record in run.records]
+        out.append(Comparison(experiment.points[i], rates, forecast(costs[scene], run.load, setting, machine)))
+    return out, costs
+
+
+def errors(comparisons: Sequence[Comparison]) -> tuple[float, float]:
+    """(median, worst) absolute relative error; zeros for none."""
+    values = np.abs([c.error for c in comparisons])
+    return (float(np.median(values)), float(values.max())) if len(values) else (0.0, 0.0)
