@@ -93,7 +93,7 @@ def _keep(path: Path, frame: np.ndarray) -> None:
 def _kept(path: Path, shape: tuple[int, int]) -> np.ndarray | None:
     """The frame in a file; None if there is none, or it is damaged and has to be drawn again."""
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             frame = archive["words"]
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         return None

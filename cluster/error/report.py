@@ -33,14 +33,17 @@ class Axis:
 
 COSTS = (
     Axis("frame_ms", "frame time, ms (median)", ("sampling", "render", "culling")),
+    Axis("message_bytes", "message bytes a frame (between ranks)", ("sampling", "culling")),
     Axis("frame_bytes", "bytes a frame (messages + picture)", ("sampling", "render", "culling", "image")),
     Axis("position_bytes", "bytes a position (resident)", ("positions",)),
 )
 ERRORS = (
     Axis("flip", "FLIP, mean"),
     Axis("dissimilarity", "1 − SSIM"),
-    Axis("coverage_error", "coverage error (holes + false)"),
-    Axis("colour_rmse", "colour RMSE on the foreground"),
+    Axis("rmse", "colour RMSE, whole picture"),
+    Axis("coverage_error", "coverage error: holes + false pixels"),
+    Axis("colour_rmse", "colour RMSE, reference's foreground"),
+    Axis("depth_rmse", "depth RMSE / scene radius"),
 )
 
 COLUMNS = {
@@ -75,11 +78,13 @@ _LEGEND = (
     "Errors are means over the cameras. FLIP (0…1, 67 pixels a degree), SSIM (Gaussian window, σ = 1.5 px) and "
     "PSNR (range 255, 100 dB where equal) are of the whole picture; foreground PSNR, holes and false pixels (shares) "
     "of the pixels that the reference covers; depth RMSE of the pixels that both cover, as a share of the scene's "
-    "radius."
+    "radius. "
+    "Ringed in the diagrams: the Pareto front, the points that no other beats in both; a dotted line is zero error."
 )
 
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000", "#7f7f7f")  # Okabe and Ito
 _MARKERS = "osD^vP*X"
+_FRONT = "Pareto front"
 
 
 def error_report(sweep: Sweep, config: ErrorConfig, command: str) -> Report:
@@ -93,10 +98,13 @@ def error_report(sweep: Sweep, config: ErrorConfig, command: str) -> Report:
             report.text("No point of this scene could be measured.")
             continue
         size = f"{rows[0]['width']}×{rows[0]['height']} px, frames {config.frames}, {config.repeats} repeats"
-        report.plot(_diagrams(rows), f"{scene.name}, {size}. Ringed: the Pareto front.")
+        for cost in COSTS:
+            drawn = [row for row in rows if _section(row) in cost.sections]
+            if drawn:
+                report.plot(_diagrams(drawn, cost), f"{scene.name}: error against {cost.label}. {size}.")
         fronts = _front_names(rows)
-        cells = [[*(row[key] for key in COLUMNS), fronts[i]] for i, row in enumerate(rows)]
-        report.table([*COLUMNS.values(), "FLIP front"], cells, f"{scene.name}, {rows[0]['rasterizer']}")
+        cells = [[*(row[key] for key in COLUMNS), front] for row, front in zip(rows, fronts, strict=True)]
+        report.table([*COLUMNS.values(), "FLIP front"], cells, f"{scene.name}, {size}")
     report.heading("Omissions")
     report.table(["left out", "why"], [[omission.what, omission.why] for omission in sweep.omissions])
     return report
@@ -114,72 +122,95 @@ def pareto_front(cost: Sequence[float], error: Sequence[float]) -> list[int]:
     return front
 
 
-def _drawn(rows: list[Row], cost: Axis, error: Axis) -> list[Row]:
-    """The rows that have a place in a diagram."""
-    return [row for row in rows if row["key"].partition(".")[0] in cost.sections and row[error.column] is not None]
+def _section(row: Row) -> str:
+    return row["key"].partition(".")[0]
 
 
 def _front_names(rows: list[Row]) -> list[str]:
     """For each row, the costs in whose diagram against FLIP it is on the front."""
     names: list[list[str]] = [[] for _ in rows]
-    for cost, name in zip(COSTS, ("time", "bytes", "position bytes"), strict=True):
-        drawn = [i for i, row in enumerate(rows) if row in _drawn([row], cost, ERRORS[0])]
+    for cost, name in zip(COSTS, ("time", "message bytes", "bytes", "position bytes"), strict=True):
+        drawn = [i for i, row in enumerate(rows) if _section(row) in cost.sections]
         for i in pareto_front([rows[i][cost.column] for i in drawn], [rows[i]["flip"] for i in drawn]):
             names[drawn[i]].append(name)
     return [", ".join(found) for found in names]
 
 
-def _diagrams(rows: list[Row]) -> Any:
-    """One scene: a row of diagrams for each error, a column for each cost that some method changes."""
+def _diagrams(rows: list[Row], cost: Axis) -> Any:
+    """A diagram for each error of which some row has a value."""
     from matplotlib.figure import Figure
 
-    costs = [cost for cost in COSTS if any(row["key"].partition(".")[0] in cost.sections for row in rows)]
+    errors = [error for error in ERRORS if any(row[error.column] is not None for row in rows)]
     methods = list(dict.fromkeys(row["method"] for row in rows))
-    figure = Figure(figsize=(4.6 * len(costs), 3.2 * len(ERRORS)), layout="constrained")
-    panels = figure.subplots(len(ERRORS), len(costs), squeeze=False, sharex="col")
-    for i, error in enumerate(ERRORS):
-        for j, cost in enumerate(costs):
-            _diagram(panels[i, j], _drawn(rows, cost, error), methods, cost, error)
-            panels[i, j].set_ylabel(error.label)
-            if i == len(ERRORS) - 1:
-                panels[i, j].set_xlabel(cost.label)
+    n_rows = -(-len(errors) // 3)
+    figure = Figure(figsize=(15, 4 * n_rows))
+    panels = figure.subplots(n_rows, 3, squeeze=False, gridspec_kw={"wspace": 0.3, "hspace": 0.28}).ravel()
+    for panel, error in zip(panels, errors, strict=False):
+        _diagram(panel, [row for row in rows if row[error.column] is not None], methods, cost, error)
+    for panel in panels[len(errors) :]:
+        panel.set_axis_off()
     handles = {}
-    for panel in panels.flat:
-        for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
-            handles.setdefault(label, handle)
-    figure.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=3, frameon=False)
+    for panel in panels:
+        handles |= {label: handle for handle, label in zip(*panel.get_legend_handles_labels(), strict=True)}
+    order = [label for label in (*methods, _FRONT) if label in handles]
+    figure.legend(
+        [handles[label] for label in order],
+        order,
+        loc="lower center",
+        bbox_to_anchor=(0.5, 0.9),
+        ncols=4,
+        frameon=False,
+    )
     return figure
 
 
 def _diagram(panel: Any, rows: list[Row], methods: list[str], cost: Axis, error: Axis) -> None:
-    panel.set_xscale("log")
-    panel.set_yscale("log")
+    from matplotlib.ticker import LogFormatter
+
+    panel.set(xscale="log", yscale="log", xlabel=cost.label, ylabel=error.label)
+    for axis in (panel.xaxis, panel.yaxis):  # plain numbers: typesetting powers of ten is most of the cost of a figure
+        axis.set_major_formatter(LogFormatter())
+        axis.set_minor_formatter(LogFormatter(minor_thresholds=(1.0, 0.5)))
     panel.grid(which="both", alpha=0.25, linewidth=0.5)
+    panel.margins(x=0.14, y=0.08)
     positive = [row[error.column] for row in rows if row[error.column] > 0]
-    exact = 0.3 * min(positive) if positive else 1e-3
-    height = np.array([row[error.column] or exact for row in rows])
-    width = np.array([row[cost.column] for row in rows])
+    exact = 0.3 * min(positive, default=1.0)
+    x = np.array([row[cost.column] for row in rows])
+    y = np.array([row[error.column] or exact for row in rows])
     if len(positive) < len(rows):
         panel.axhline(exact, color="#999999", linewidth=0.8, linestyle=":")
-        panel.annotate(
-            "0: equal", (0.99, exact), xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize=7
-        )
+        panel.annotate("0", (1.005, exact), xycoords=("axes fraction", "data"), va="center", fontsize=9)
+    front = pareto_front(x.tolist(), y.tolist())
+    ring = {"markersize": 12, "markerfacecolor": "none", "markeredgecolor": "black", "markeredgewidth": 0.8}
+    panel.plot(x[front], y[front], "o", label=_FRONT, **ring)
+    first = [*front, *(i for i in range(len(rows)) if i not in front)]
     for k, method in enumerate(methods):
         own = [i for i, row in enumerate(rows) if row["method"] == method]
-        if not own:
-            continue
-        ordered = all(not isinstance(rows[i]["value"], str) for i in own)  # names have no line between them
-        style = {"color": _COLOURS[k % len(_COLOURS)], "marker": _MARKERS[k % len(_MARKERS)], "markersize": 5}
-        panel.plot(width[own], height[own], linestyle="-" if ordered else "", linewidth=1.2, label=method, **style)
-        for i in own:
-            panel.annotate(
-                str(rows[i]["value"]),
-                (width[i], height[i]),
-                (4, 3),
-                textcoords="offset points",
-                fontsize=6,
-                color=style["color"],
+        if own:
+            line = "" if isinstance(rows[own[0]]["value"], str) else "-"  # there is nothing between two names
+            panel.plot(
+                x[own],
+                y[own],
+                _MARKERS[k % len(_COLOURS)] + line,
+                color=_COLOURS[k % len(_COLOURS)],
+                label=method,
+                markersize=5,
             )
-    front = pareto_front(width.tolist(), height.tolist())
-    ring = {"marker": "o", "markersize": 11, "markerfacecolor": "none", "markeredgecolor": "black", "linestyle": ""}
-    panel.plot(width[front], height[front], markeredgewidth=0.8, label="Pareto front", **ring)
+    _write_values(panel, [rows[i] for i in first], x[first], y[first], methods)
+
+
+def _write_values(panel: Any, rows: list[Row], x: np.ndarray, y: np.ndarray, methods: list[str]) -> None:
+    """The swept value beside each point; one that would cover an earlier one is left out."""
+    panel.autoscale_view()  # else the limits are found when the figure is drawn, and positions before that are wrong
+    places = panel.transAxes.inverted().transform(panel.transData.transform(np.column_stack([x, y])))
+    written: list[tuple[float, float, float]] = []  # left end, right end, height; shares of the diagram
+    for row, (across, up), point in zip(rows, places, zip(x, y, strict=True), strict=True):
+        text = str(row["value"])
+        length = 0.022 * len(text) + 0.01
+        at_edge = across + length > 0.97
+        left = across - length - 0.02 if at_edge else across + 0.02
+        if all(left > end or left + length < start or abs(up - height) > 0.05 for start, end, height in written):
+            written.append((left, left + length, up))
+            colour = _COLOURS[methods.index(row["method"]) % len(_COLOURS)]
+            offset, side = ((-6, 4), "right") if at_edge else ((6, 4), "left")
+            panel.annotate(text, point, offset, textcoords="offset points", ha=side, fontsize=8, color=colour)

@@ -137,7 +137,7 @@ def _frame_errors(
     wanted, found = _rgb(reference, scene), decode_picture(encoded, image, camera.width, camera.height)
     in_front = metrics.foreground(reference)
     colour_rmse = metrics.rmse(wanted[in_front], found[in_front])
-    similarity = metrics.ssim(wanted, found)
+    rmse, similarity = metrics.rmse(wanted, found), metrics.ssim(wanted, found)
     return {
         "points": chosen.n_points,
         "entries": len(chosen.entries),
@@ -147,7 +147,8 @@ def _frame_errors(
         "flip": metrics.flip(wanted, found),
         "ssim": similarity,
         "dissimilarity": None if similarity is None else 1 - similarity,
-        "psnr_db": metrics.psnr_db(metrics.rmse(wanted, found)),
+        "rmse": rmse,
+        "psnr_db": metrics.psnr_db(rmse),
         "colour_rmse": colour_rmse,
         "colour_psnr_db": metrics.psnr_db(colour_rmse),
         **(_frame_geometry(scene, reference, words) if image.codec == "png" else dict.fromkeys(GEOMETRY)),
