@@ -16,8 +16,11 @@ from splatpipe.cluster.model.fit import fit_latency_and_rate
 from splatpipe.cluster.model.inequalities import Need, bottleneck, conditions
 from splatpipe.cluster.model.parameters import Source
 from splatpipe.cluster.model.present import make_report, record
+from splatpipe.cluster.model.probes import _chase, _one_cycle, squares_in_view
 from splatpipe.cluster.model.system_file import read_system_file, write_system_file
 from splatpipe.nodes.raster import PointSize, ResidentPoints
+from splatpipe.nodes.raster.gl_context import gl_available
+from splatpipe.nodes.raster.gl_probe import SIZES_BYTES, flop_per_s, transfer_times
 from splatpipe.nodes.raster.reference import covered_pixels, point_indices, squares
 from splatpipe.shared.build import BuildSettings, build_scene
 from splatpipe.shared.camera import look_at, perspective_camera
@@ -26,6 +29,7 @@ from splatpipe.shared.messages import RENDER_POINT
 from splatpipe.shared.synth import CityScan
 
 SYSTEMS = Path(__file__).parent.parent / "configs" / "systems"
+AVAILABLE, REASON = gl_available()
 THESIS = SYSTEMS / "thesis-2005.toml"
 
 
@@ -261,6 +265,36 @@ def test_covered_pixels_are_counted_within_the_image():
         mask[max(row, 0) : row + side, max(column, 0) : column + side] = True
         counted += int(mask.sum())
     assert covered_pixels(points, camera, entries, size) == counted > 500
+
+
+def test_the_squares_that_measure_fragments_lie_wholly_in_the_image():
+    pose = look_at(np.array([5e5, -3.0, 0.5]), np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    camera = perspective_camera(frame=0, world_from_camera=pose, fov_y_rad=0.6, width=640, height=64, near=0.1)
+    entries = np.array([(0, 100, 1)], RENDER_POINT)
+    points = squares_in_view(camera, 64, 100)
+    assert covered_pixels(points, camera, entries, PointSize(64)) == pytest.approx(100 * 64 * 64, rel=0.02)
+
+
+def test_the_memory_latency_probe_visits_every_line():
+    following = np.zeros((1000, 2), np.int64)
+    _one_cycle(following, 1)
+    at, seen = 0, set()
+    for _ in range(1000):
+        at = int(following[at, 0])
+        seen.add(at)
+    assert len(seen) == 1000
+    assert _chase(following, 1000) == 0
+
+
+@pytest.mark.gl
+@pytest.mark.skipif(not AVAILABLE, reason=REASON)
+def test_the_gl_device_is_measured():
+    times = transfer_times()
+    assert set(times) == {"down", "up"}
+    for seconds in times.values():
+        assert len(seconds) == len(SIZES_BYTES)
+        assert min(seconds) > 0
+    assert 0 < flop_per_s() < math.inf
 
 
 # --- a real run

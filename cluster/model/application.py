@@ -17,6 +17,7 @@ from ..job import Job
 from ..measured import measured_run
 from ..plan.topology import decide
 from .parameters import NOT_APPLICABLE, Application, Quantity, RankLoad, Traffic, derived, measured, parameters
+from .probes import Figure
 
 FRAMES = 30
 """Frames of the instrumented run, spread over the whole camera path."""
@@ -86,12 +87,16 @@ def measured_application(
                 "read_backs": derived(1 if gpu else 0),
                 "vertices": measured(n_points, "the frame with most points"),
                 "vertex_bytes": measured(entries_bytes if gpu else 0, "entries; points stay on the GPU"),
-                "vertices_per_s": measured(found["render"]["vertices_per_s"]),
+                "vertices_per_s": _rate(found["render"]["vertices_per_s"], run["rasterizer"]),
                 "fragments": derived(_fragments(job, octree, int(np.argmax(per_frame["points"])))),
-                "fragments_per_s": measured(found["render"]["fragments_per_s"]),
+                "fragments_per_s": _rate(found["render"]["fragments_per_s"], run["rasterizer"]),
             }
         loads.append(RankLoad(role, **values))
     return Application(frames_per_s, tuple(loads), _traffic(run, job, bits_bytes, entries_bytes))
+
+
+def _rate(figure: dict[str, Any], rasterizer: str) -> Quantity:
+    return measured(figure["value"], f"{rasterizer}, {Figure(**figure).spread}")
 
 
 def _octree_bytes(octree: Octree) -> int:

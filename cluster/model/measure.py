@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,6 @@ import numpy as np
 
 from ...nodes.render import load_points
 from ...shared.config import load_config
-from ...shared.errors import SplatpipeError
 from ...shared.files import write_json
 from ...shared.messages import Kind
 from ..job import Job
@@ -33,7 +33,7 @@ def measure_ranks(config: Path, overrides: list[str], roles: list[str], rasteriz
     """What ranks of these roles measure: ``ranks`` (one dict each), ``render`` (rates), ``links`` (one a pair).
 
     rasterizer : the one that the run drew with. One rank needs no MPI: it is this process.
-    Raises SplatpipeError if a rank fails.
+    Raises SystemExit if a rank fails, which has said why.
     """
     if len(roles) == 1:
         machine = _machine()
@@ -44,7 +44,7 @@ def measure_ranks(config: Path, overrides: list[str], roles: list[str], rasteriz
         arguments += [part for item in overrides for part in ("--set", item)]
         status = launch(arguments, len(roles), lambda _: None)
         if status:
-            raise SplatpipeError(f"measuring the ranks: exit status {status}")
+            sys.exit(status)  # the rank that failed has said why
         return json.loads(out.read_text())
 
 
@@ -83,13 +83,13 @@ def measured_system(found: dict[str, Any], roles: list[str]) -> System:
         values = {item.name: UNKNOWN for item in parameters(RankSystem)}
         for name, value in machine["values"].items():
             values[name] = measured(value, machine["notes"].get(name, ""))
-        gpu = found["render"]["gpu"] if role in ("render", "single") else {}
+        gpu, notes = found["render"]["gpu"] if role in ("render", "single") else ({}, {})
         for name in (name for name in values if name.startswith(("gpu_", "video_"))):
-            values[name] = _or_unknown(gpu.get(name)) if gpu else NOT_APPLICABLE
+            values[name] = _or_unknown(gpu.get(name), notes.get(name, "")) if gpu else NOT_APPLICABLE
         ranks.append(RankSystem(role, **values))
     links = []
     for link in found["links"]:
-        off = {kind: f"a sample is {share:.0%} off the line" for kind, share in link["worst_residual"].items()}
+        off = {kind: _off_the_line(share) for kind, share in link["worst_residual"].items()}
         notes = {"latency_s": off["raw"], "bytes_per_s": off["raw"], "polite_bytes_per_s": off["polite"]}
         values = {item.name: _or_unknown(link[item.name], notes.get(item.name, "")) for item in parameters(Link)}
         links.append(Link(link["sender"], link["receiver"], **values))
@@ -104,18 +104,19 @@ def _machine() -> dict[str, Any]:
     """The host's own parameters."""
     uncached, cached = probes.uncached_bytes(), probes.CACHED_BYTES
     sizes = {"memory_": f"{uncached >> 20} MiB in use", "cache_": f"{cached >> 10} KiB in use"}
-    values = {
+    figures = {
         "cpu_flop_per_s": probes.cpu_flop_per_s(np.float64),
         "cpu_float32_flop_per_s": probes.cpu_flop_per_s(np.float32),
-        "memory_bytes": probes.memory_bytes(),
-        "cache_bytes": probes.cache_bytes(),
         "memory_latency_s": probes.memory_latency_s(uncached),
         "memory_bytes_per_s": probes.memory_bytes_per_s(uncached),
         "cache_latency_s": probes.memory_latency_s(cached),
         "cache_bytes_per_s": probes.memory_bytes_per_s(cached),
     }
-    timed = [name for name in values if name.endswith("_s")]
-    notes = {name: note for name in timed for start, note in sizes.items() if name.startswith(start)}
+    values = {name: figure.value for name, figure in figures.items()}
+    values |= {"memory_bytes": probes.memory_bytes(), "cache_bytes": probes.cache_bytes()}
+    notes = {name: figure.spread for name, figure in figures.items()}
+    for name in notes:
+        notes[name] += "".join(f", {size}" for start, size in sizes.items() if name.startswith(start))
     return {"host": platform.node(), "values": values, "notes": notes}
 
 
@@ -125,17 +126,24 @@ def _render(config: Path, overrides: list[str], rasterizer: str) -> dict[str, An
     points = load_points(job.scene, job.colouring, verify=False)
     camera, threads = job.camera(0), job.config.render.threads or None
     return {
-        "vertices_per_s": probes.points_per_s(rasterizer, points, camera, threads),
-        "fragments_per_s": probes.fragments_per_s(rasterizer, camera, threads),
-        "gpu": _gpu() if rasterizer.startswith("gl") else {},
+        "vertices_per_s": probes.points_per_s(rasterizer, points, camera, threads)._asdict(),
+        "fragments_per_s": probes.fragments_per_s(rasterizer, camera, threads)._asdict(),
+        "gpu": _gpu() if rasterizer.startswith("gl") else ({}, {}),
     }
 
 
-def _gpu() -> dict[str, float | None]:
+def _gpu() -> tuple[dict[str, float | None], dict[str, str]]:
+    """The GPU's parameters by name, and notes on them."""
     from ...nodes.raster.gl_probe import SIZES_BYTES, flop_per_s, transfer_times
 
     found: dict[str, float | None] = {"gpu_flop_per_s": flop_per_s()}
+    notes = {}
     for way, seconds in transfer_times().items():
         fit = fit_latency_and_rate(SIZES_BYTES, seconds)
         found |= {f"gpu_{way}_latency_s": fit.latency_s, f"gpu_{way}_bytes_per_s": fit.per_s}
-    return found
+        notes[f"gpu_{way}_bytes_per_s"] = _off_the_line(fit.worst_residual)
+    return found, notes
+
+
+def _off_the_line(residual: float) -> str:
+    return f"a sample is {residual:.0%} off the line"

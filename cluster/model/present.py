@@ -67,7 +67,7 @@ def make_report(model: Model, command: str) -> Report:
     )
     report.text(f"Left out, nothing to do: {_left_out(model)}.")
     report.heading("System parameters (thesis Table 3-1 A)")
-    report.text(f"P_n = {len(model.system.ranks)} ranks.")
+    report.text(f"P_n = {len(model.system.ranks)} ranks. Those that share a host share its figures.")
     report.table(*_parameter_table(model.system.ranks, [rank.role for rank in model.system.ranks]))
     if model.system.links:
         names = [f"{link.sender} – {link.receiver}" for link in model.system.links]
@@ -81,7 +81,8 @@ def make_report(model: Model, command: str) -> Report:
         "O_CPU counts no instructions: it is the time of the rank's stage (95th percentile) in multiply-adds of S_CPU, "
         "so that (7) says how long the stage takes here, and a system file with another S_CPU how long it would take "
         "there. N_m counts reads that do not follow the one before; data read in order is fetched ahead and pays no "
-        "latency. D_CP is every array of the stage once, an upper bound."
+        "latency. D_CP is every array of the stage once, an upper bound. Where a "
+        "GPU draws, (7) of the render rank holds the GPU's time as well; (3) and (6) state it alone."
     )
     report.heading("Misprints of the thesis")
     report.table(COLUMNS, ERRATA)

@@ -1,6 +1,6 @@
 """What one rank measures by itself: its CPU, its memory, and its rasterizer's rates.
 
-Each probe repeats a short piece of work and takes the median; none takes longer than about a second.
+Each probe repeats a short piece of work and gives the median and the spread; none takes longer than a few seconds.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ import os
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -26,20 +27,33 @@ CACHED_BYTES = 256 << 10
 _MOST_UNCACHED_BYTES = 512 << 20
 _CHASE_STEPS = 200_000
 _FLOP_ELEMENTS = 256
-_FLOP_ROUNDS = 20_000
+_FLOP_ROUNDS = 500_000
 _MOST_POINTS = 4_000_000
 _SQUARE_PX = 64
 _SQUARES = 2_000
-_MEMORY_REPEATS = 5
-_DRAW_REPEATS = 5
+_REPEATS = 7
 
 
-def cpu_flop_per_s(dtype: type[np.floating]) -> float:
+class Figure(NamedTuple):
+    """Median, lowest and highest of repeated measurements."""
+
+    value: float
+    low: float
+    high: float
+    repeats: int
+
+    @property
+    def spread(self) -> str:
+        """The spread, for people."""
+        return f"{self.low:.3g} … {self.high:.3g}, {self.repeats} times"
+
+
+def cpu_flop_per_s(dtype: type[np.floating]) -> Figure:
     """Multiply-adds of one core, two operations each: compiled, vectorised, operands in the first-level cache."""
     values, factor, term = np.ones(_FLOP_ELEMENTS, dtype), dtype(0.999), dtype(0.001)
     _multiply_add(values, factor, term, 1)
-    seconds = _median_s(lambda: _multiply_add(values, factor, term, _FLOP_ROUNDS), _MEMORY_REPEATS)
-    return 2 * _FLOP_ELEMENTS * _FLOP_ROUNDS / seconds
+    times = _times_s(lambda: _multiply_add(values, factor, term, _FLOP_ROUNDS), _REPEATS)
+    return _figure(2 * _FLOP_ELEMENTS * _FLOP_ROUNDS / times)
 
 
 def uncached_bytes() -> int:
@@ -47,7 +61,7 @@ def uncached_bytes() -> int:
     return min(max(2 * cache_bytes(), 64 << 20), _MOST_UNCACHED_BYTES, available_memory_bytes() // 4)
 
 
-def memory_latency_s(working_set_bytes: int) -> float:
+def memory_latency_s(working_set_bytes: int) -> Figure:
     """Seconds of a read whose address is the result of the read before, in random order (address translation included).
 
     Cost: one pass of writes over the working set, then a fixed number of reads.
@@ -55,17 +69,16 @@ def memory_latency_s(working_set_bytes: int) -> float:
     n_lines = working_set_bytes // CACHE_LINE_BYTES
     following = np.empty((n_lines, CACHE_LINE_BYTES // 8), np.int64)
     _one_cycle(following, 1)
-    steps = _CHASE_STEPS
-    _chase(following, min(steps, n_lines))
-    return _median_s(lambda: _chase(following, steps), 3) / steps
+    _chase(following, min(_CHASE_STEPS, n_lines))
+    return _figure(_times_s(lambda: _chase(following, _CHASE_STEPS), _REPEATS) / _CHASE_STEPS)
 
 
-def memory_bytes_per_s(working_set_bytes: int) -> float:
+def memory_bytes_per_s(working_set_bytes: int) -> Figure:
     """Bytes one core reads in order in a second."""
     words = np.ones(working_set_bytes // 8, np.uint64)
     rounds = max(1, (32 << 20) // working_set_bytes)
     _read(words, 1)
-    return rounds * words.nbytes / _median_s(lambda: _read(words, rounds), _MEMORY_REPEATS)
+    return _figure(rounds * words.nbytes / _times_s(lambda: _read(words, rounds), _REPEATS))
 
 
 def memory_bytes() -> int:
@@ -81,53 +94,69 @@ def cache_bytes() -> int:
     return max((int(text[:-1]) * units[text[-1]] for text in found if text[-1:] in units), default=0)
 
 
-def points_per_s(name: str, points: ResidentPoints, camera: Camera, threads: int | None) -> float:
+def points_per_s(name: str, points: ResidentPoints, camera: Camera, threads: int | None) -> Figure:
     """Points drawn in a second, one pixel each, frame included: O_VP as a whole, as the thesis measures it (3.3.1).
 
     Draws the first points of the scene, however many of them the frame shows.
     """
     entries = np.zeros(1, RENDER_POINT)
     entries["range"], entries["stride"] = min(len(points), _MOST_POINTS), 1
-    return _drawn_per_s(name, points, camera, PointSize(), entries, threads) * int(entries["range"][0])
+    return _drawn_per_s(name, points, camera, PointSize(), entries, threads, int(entries["range"][0]))
 
 
-def fragments_per_s(name: str, camera: Camera, threads: int | None) -> float:
+def fragments_per_s(name: str, camera: Camera, threads: int | None) -> Figure:
     """Pixels filled in a second by large squares, hidden ones included: O_FP (thesis 3.3.1, by quadrilaterals).
 
     The squares lie at random in the image, at random depths.
     """
-    rng = np.random.default_rng(1)
-    inverse = np.linalg.inv(camera.clip_from_world)
-    margin = 1 - _SQUARE_PX / np.array([camera.width, camera.height])
-    clip = np.ones((_SQUARES, 4))
-    clip[:, :2] = rng.uniform(-1, 1, (_SQUARES, 2)) * np.maximum(margin, 0)
-    on_near_plane = clip @ inverse.T  # z/w = 1 there
-    towards = on_near_plane[:, :3] / on_near_plane[:, 3:] - camera.eye
-    x, y, z = np.ascontiguousarray((towards * rng.uniform(2, 100, (_SQUARES, 1))).T, np.float32)
-    colour = np.full(_SQUARES, 0xFF00_00FF, np.uint32)
-    points = ResidentPoints(x, y, z, colour, np.zeros(1, np.int64), camera.eye[None].astype(np.float64))
+    side = min(_SQUARE_PX, camera.width, camera.height)
+    points = squares_in_view(camera, side, _SQUARES)
     entries = np.zeros(1, RENDER_POINT)
     entries["range"], entries["stride"] = _SQUARES, 1
-    side = min(_SQUARE_PX, camera.width, camera.height)
-    frames_per_s = _drawn_per_s(name, points, camera, PointSize(pixels=side), entries, threads)
-    return frames_per_s * _SQUARES * side * side
+    size = PointSize(pixels=side)
+    return _drawn_per_s(name, points, camera, size, entries, threads, _SQUARES * side * side)
+
+
+def squares_in_view(camera: Camera, side: int, n: int) -> ResidentPoints:
+    """Points whose squares, ``side`` px wide, lie wholly in the image, at random places and depths."""
+    rng = np.random.default_rng(1)
+    inverse = np.linalg.inv(camera.clip_from_world)
+    margin = 1 - side / np.array([camera.width, camera.height])
+    clip = np.ones((n, 4))
+    clip[:, :2] = rng.uniform(-1, 1, (n, 2)) * margin
+    on_near_plane = clip @ inverse.T  # z/w = 1 there
+    towards = on_near_plane[:, :3] / on_near_plane[:, 3:] - camera.eye
+    x, y, z = np.ascontiguousarray((towards * rng.uniform(2, 100, (n, 1))).T, np.float32)
+    colour = np.full(n, 0xFF00_00FF, np.uint32)
+    return ResidentPoints(x, y, z, colour, np.zeros(1, np.int64), camera.eye[None].astype(np.float64))
 
 
 def _drawn_per_s(
-    name: str, points: ResidentPoints, camera: Camera, size: PointSize, entries: np.ndarray, threads: int | None
-) -> float:
+    name: str,
+    points: ResidentPoints,
+    camera: Camera,
+    size: PointSize,
+    entries: np.ndarray,
+    threads: int | None,
+    amount: int,
+) -> Figure:
+    """What a frame draws, ``amount``, over the time of the frame."""
     with make_rasterizer(name, points, camera.width, camera.height, size, threads) as rasterizer:
         rasterizer.draw(camera, entries)
-        return 1 / _median_s(lambda: rasterizer.draw(camera, entries), _DRAW_REPEATS)
+        return _figure(amount / _times_s(lambda: rasterizer.draw(camera, entries), _REPEATS))
 
 
-def _median_s(work: Callable[[], object], repeats: int) -> float:
+def _figure(samples: np.ndarray) -> Figure:
+    return Figure(float(np.median(samples)), float(samples.min()), float(samples.max()), len(samples))
+
+
+def _times_s(work: Callable[[], object], repeats: int) -> np.ndarray:
     times = []
     for _ in range(repeats):
         start = time.perf_counter()
         work()
         times.append(time.perf_counter() - start)
-    return float(np.median(times))
+    return np.array(times)
 
 
 @njit(nogil=True, cache=True)
