@@ -69,8 +69,9 @@ def launch(
     ranks: int,
     on_record: Callable[[dict[str, Any]], None],
     variables: Mapping[str, str] | None = None,
+    module: str = "splatpipe.cluster",
 ) -> int:
-    """Run ``python -m splatpipe.cluster ARGUMENTS`` on ``ranks`` ranks; the exit status.
+    """Run ``python -m MODULE ARGUMENTS`` on ``ranks`` ranks; the exit status.
 
     on_record : called with each record that is not about a rank's start.
     variables : added to the environment of the ranks.
@@ -86,7 +87,7 @@ def launch(
         str(ranks),
         sys.executable,
         "-m",
-        "splatpipe.cluster",
+        module,
         *arguments,
     ]
     environment = os.environ | {EXPECTED_RANKS: str(ranks), "PYTHONUNBUFFERED": "1"} | dict(variables or {})
@@ -101,7 +102,7 @@ def launch(
         env=environment,
         start_new_session=True,
     )
-    with _terminated_with_us(process):
+    with process, _terminated_with_us(process):
         return _Relay(process, on_record).run()
 
 
