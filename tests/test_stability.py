@@ -2,10 +2,15 @@
 
 import json
 
+import numpy as np
 import pytest
 from splatpipe.cluster.stability import suite
 from splatpipe.cluster.stability.suite import all_cases
+from splatpipe.nodes.culling import CullingNode
+from splatpipe.nodes.raster import reference
 from splatpipe.shared.errors import InputError
+from splatpipe.shared.messages import VisibilityBits
+from splatpipe.shared.stability import eigenvalues
 from splatpipe.shared.stability.case import FAILED, OUT_OF_REACH, PASSED, case, cases, expect, out_of_reach, run
 
 
@@ -69,3 +74,35 @@ def test_the_command_writes_what_it_measured_and_fails_when_a_case_does(tmp_path
     assert "a/bad" in (tmp_path / "s.md").read_text()
     with pytest.raises(InputError, match="no case of that name"):
         suite.stability_command("nothing", None, None)
+
+
+def named(name):
+    return next(c for c in all_cases() if c.name == name)
+
+
+def test_the_suite_notices_what_it_is_there_for(monkeypatch):
+    def world_in_float32(camera, block_origin):
+        m = camera.pixel_from_world.astype(np.float32)
+        out = np.tile(m, (len(block_origin), 1, 1))
+        out[:, :, 3] += block_origin.astype(np.float32) @ m[:, :3].T
+        return out
+
+    def plain_moments(moments, central):
+        central[0] = moments[0]
+        central[1:4] = moments[1:4] / moments[0]
+        pairs = [(a, b) for a in range(3) for b in range(a, 3)]
+        central[4:] = [moments[4 + i] - central[1 + a] * moments[1 + b] for i, (a, b) in enumerate(pairs)]
+
+    def culls_a_little(self, camera):
+        visible = see(self, camera).unpack()
+        visible[-1] = 0
+        return VisibilityBits.pack(camera.frame, visible)
+
+    see = CullingNode.process
+    monkeypatch.setattr(reference, "pixel_from_blocks", world_in_float32)
+    monkeypatch.setattr(eigenvalues, "central_moments", plain_moments)
+    assert run(named("projection/translation 6.4e+06")).verdict == FAILED
+    assert run(named("eigen/far corner of a cell 2")).verdict == FAILED
+    monkeypatch.undo()
+    monkeypatch.setattr(CullingNode, "process", culls_a_little)
+    assert run(named("cloud/drawn coplanar")).verdict == FAILED

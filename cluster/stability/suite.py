@@ -23,7 +23,10 @@ MODULES = (
     "splatpipe.shared.stability.eigenvalues",
     "splatpipe.shared.stability.cameras",
     "splatpipe.shared.stability.grids",
+    "splatpipe.shared.stability.codecs",
+    "splatpipe.cluster.stability.messages",
     "splatpipe.cluster.stability.inequalities",
+    "splatpipe.cluster.stability.prediction",
 )
 COLUMNS = ("case", "what", "value", "bound", "unit", "verdict")
 

@@ -10,6 +10,7 @@ module           owns
 ``case``         what a case is, how it is run, its verdict
 ``eigenvalues``  flatness of a cell against 50 digits
 ``cameras``      matrices and poses against 50 digits; keyframe paths
+``codecs``       what the codecs will be held to
 ``grids``        keys, centres and normals against integers and rationals
 ===============  ============================================================
 """
