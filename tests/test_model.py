@@ -162,6 +162,11 @@ def test_a_system_file_is_read_back_as_it_was_written(tmp_path):
         ("receiver = 1", "receiver = 3", "system.link[0].receiver: found 3, expected a rank, 0…2"),
         ("receiver = 1", "receiver = 0", "system.link[0].receiver: found 0, expected another rank than the sender"),
         ("frames_per_s = 15.0", "frames_per_s = 0", "application.frames_per_s: found 0.0, expected a number > 0"),
+        (
+            "sender = 1\nreceiver = 2\nlatency",
+            "sender = 0\nreceiver = 1\nlatency",
+            "system.link[1]: found 0 to 1 again, expected each pair once",
+        ),
         ('role = "render"', "role = 3", "system.rank[2].role: found 3, expected a text"),
         ("[application]", "[applications]", "unknown key applications, did you mean application?"),
         ("version = 1", "version =", "not valid TOML"),
@@ -326,7 +331,12 @@ def test_three_ranks_are_measured_and_what_they_save_says_the_same(tmp_path):
     assert render["vertices"]["value"] >= 1
     assert all(value["value"] > 0 for name in ("vertices_per_s", "fragments_per_s") for value in [render[name]])
     sent = {(t["sender"], t["receiver"]): t["bytes"]["value"] for t in content["application"]["traffic"]}
-    assert set(sent) == {(0, 1), (0, 2), (1, 2), (2, 0)}
+    messages = content["run"]["messages"]
+    frames = content["run"]["frames"]
+    assert sent[0, 2] * 2 * frames == messages["CAMERA"]["bytes"]
+    assert sent[0, 1] * frames == messages["CAMERA"]["bytes"] / 2 + messages["VISIBILITY"]["bytes"]
+    assert sent[1, 2] * frames >= messages["RENDER_POINTS"]["bytes"]  # the largest of any frame
+    assert sent[2, 0] * frames == messages["FRAME_DONE"]["bytes"]
 
     system, application = read_system_file(saved)
     again = [

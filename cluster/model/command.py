@@ -22,11 +22,12 @@ class Model:
     """Parameters, the conditions they meet or miss, and the samples behind those that were measured.
 
     origin : where the parameters come from, for people.
-    samples : what ``measure_ranks`` found; empty where nothing was measured.
+    run : of the ``run.json`` of the instrumented run: what it reached and sent.
+    samples : what ``measure_ranks`` found.  Both are empty where nothing was measured.
     """
 
     origin: str
-    rasterizer: str
+    run: dict[str, Any]
     system: System
     application: Application
     conditions: list[Condition]
@@ -48,7 +49,7 @@ def make_model(
     Raises InputError for bad input before anything is measured.
     """
     if inside_mpi():
-        raise InputError("splatpipe model: found a rank of mpiexec, expected to be started without: it starts its own")
+        raise InputError("mpiexec: found, expected splatpipe model to be started without: it starts its own ranks")
     if frames_per_s is not None and not is_frame_rate(frames_per_s):
         raise InputError(f"--fps {frames_per_s}: expected a finite number > 0")
     filed, application = read_system_file(system_path) if system_path else (None, None)
@@ -58,7 +59,7 @@ def make_model(
         wanted = frames_per_s or load_config(config, overrides).output.fps
         run, samples, system, application = _measure(config, overrides, filed, system_path, wanted)
     elif filed is None:
-        raise InputError("splatpipe model: found neither CONFIG nor --system FILE, expected one of them or both")
+        raise InputError("found neither CONFIG nor --system FILE, expected one of them or both")
     elif application is None:
         raise InputError(f"{system_path}: application: found nothing, expected a table, or a CONFIG to measure it with")
     else:
@@ -70,7 +71,9 @@ def make_model(
     )
     if save_path is not None:
         write_system_file(save_path, origin, system, application)
-    return Model(origin, run.get("rasterizer", ""), system, application, conditions(system, application), samples)
+    told = ("topology", "rasterizer", "frames", "frames_per_s", "latency_ms", "messages")
+    run = {key: run[key] for key in told if key in run}
+    return Model(origin, run, system, application, conditions(system, application), samples)
 
 
 def _measure(

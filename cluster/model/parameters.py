@@ -98,11 +98,9 @@ class System:
     links: tuple[Link, ...]
 
     def link(self, one: int, other: int) -> Link | None:
-        """The link between two ranks, in either direction; None if nobody measured it."""
-        for link in self.links:
-            if {link.sender, link.receiver} == {one, other}:
-                return link
-        return None
+        """The link from one rank to another, else the one back; None if nobody measured either."""
+        links = {(link.sender, link.receiver): link for link in self.links}
+        return links.get((one, other)) or links.get((other, one))
 
 
 @dataclass(frozen=True)

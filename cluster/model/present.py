@@ -31,6 +31,7 @@ def record(model: Model) -> dict[str, Any]:
             "application": asdict(model.application),
             "conditions": [_condition_record(c) for c in model.conditions],
             "bottleneck": _bottleneck_text(model),
+            "run": model.run,
             "samples": model.samples,
             "errata": [dict(zip(COLUMNS, row, strict=True)) for row in ERRATA],
             "machine": machine_record(),
@@ -49,6 +50,8 @@ def print_model(model: Model, console: Console) -> None:
     console.print(table)
     console.print(f"left out, nothing to do: {_left_out(model)}")
     console.print(f"bottleneck: {_bottleneck_text(model)}")
+    if model.run:
+        console.print(_run_text(model))
     console.print(model.origin)
 
 
@@ -61,7 +64,10 @@ def make_report(model: Model, command: str) -> Report:
         "meets them all may still be late with their sum."
     )
     report.text(f"Bottleneck: {_bottleneck_text(model)}.")
+    if model.run:
+        report.text(f"{_run_text(model).capitalize()}.")
     report.heading("Conditions")
+    report.plot(_figure(model), "Time that each condition needs in a frame; the line is 1/F")
     report.table(
         _COLUMNS, _rows(model), "(2′) is (2) with the program's own messages, whose receiver sleeps as it waits"
     )
@@ -87,6 +93,31 @@ def make_report(model: Model, command: str) -> Report:
     report.heading("Misprints of the thesis")
     report.table(COLUMNS, ERRATA)
     return report
+
+
+def _run_text(model: Model) -> str:
+    run = model.run
+    return (
+        f"the instrumented run reached {run['frames_per_s']:.4g} frames/s over {run['frames']} frames, "
+        f"{run['topology']}, {run['rasterizer']}"
+    )
+
+
+def _figure(model: Model) -> Any:
+    """Bars of the time needed, on a logarithmic axis; violated ones stand out."""
+    from matplotlib.figure import Figure
+
+    shown = [c for c in reversed(model.conditions) if c.need is not None and 0 < c.need.seconds < math.inf]
+    figure = Figure(figsize=(8, 0.6 + 0.28 * len(shown)))
+    axes = figure.subplots()
+    times = [c.need.seconds * 1e3 for c in shown if c.need is not None]
+    colours = ["#c0392b" if c.verdict == "violated" else "#4a7fb5" for c in shown]
+    axes.barh([f"({c.number}) {c.what}, {c.where}" for c in shown], times, color=colours)
+    axes.axvline(1e3 / model.application.frames_per_s, color="black", linewidth=1)
+    axes.set_xscale("log")
+    axes.set_xlabel(f"ms a frame; 1/F = {1e3 / model.application.frames_per_s:.4g} ms")
+    axes.grid(axis="x", alpha=0.3)
+    return figure
 
 
 def _rows(model: Model) -> list[list[Any]]:

@@ -54,6 +54,9 @@ def read_system_file(path: Path) -> tuple[System, Application | None]:
     if not ranks:
         raise reader.wrong("system.rank", "no rank", "a [[system.rank]] for each rank")
     links = reader.parts(Link, system, "system.link", len(ranks))
+    for i, link in enumerate(links):
+        if any((link.sender, link.receiver) == (other.sender, other.receiver) for other in links[:i]):
+            raise reader.wrong(f"system.link[{i}]", f"{link.sender} to {link.receiver} again", "each pair once")
     application = None
     if "application" in data:
         table = reader.table(data, "application", ("frames_per_s", "rank", "traffic"))
