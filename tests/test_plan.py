@@ -141,7 +141,7 @@ def test_more_cores_gain_more_until_the_slowest_stage_is_left(config):
     found = [estimate(job, work, cores) for cores in (1, 2, 3, 16)]
     times = [e.pipelined_s for e in found]
     assert times == sorted(times, reverse=True)
-    assert times[-1] == pytest.approx(max(3e-3, found[-1].render_s) + topology.COSTS.message_s)
+    assert times[-1] == pytest.approx(max(3e-3, found[-1].render_s) + found[-1].message_s)
 
 
 def test_encoders_that_fill_the_cores_leave_nothing_to_gain(config):

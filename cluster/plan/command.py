@@ -12,7 +12,7 @@ from ..job import Job
 from ..record import machine_record
 from ..report import Report, as_text
 from .ablation import Ablation, ablate
-from .needs import parts
+from .needs import parts, with_measured
 from .topology import decide
 from .whole_runs import ablate_runs, import_times
 from .workload import Workload
@@ -32,12 +32,13 @@ def plan_command(config_path: Path, overrides: list[str], *, measure: bool = Fal
     if measure:
         measured = [*ablate(job), *ablate_runs(job, config_path, overrides)]
         imports = import_times()
+    saved_ms = {ablation.part: ablation.saved_ms for ablation in measured}
     return {
         "config": str(config_path),
         "overrides": overrides,
         "plan": asdict(decision),
         "workload": asdict(work),
-        "parts": [asdict(part) for part in parts(job, work, decision)],
+        "parts": [asdict(part) for part in with_measured(parts(job, work, decision), saved_ms)],
         "ablation": [asdict(ablation) for ablation in measured],
         "imports": imports,
         "machine": machine_record(),

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 from ...nodes.raster.choose import resolve_rasterizer
@@ -16,6 +17,7 @@ NO_NORMALS, BACK_FACE = "normals and back-face test", "back-face test"
 LEVEL_OF_DETAIL, SPLAT_LOOP = "level of detail", "splat loop and attenuation"
 COLOUR, COLOUR_MAPS, CHECKSUMS = "colour column", "colour maps", "checksums"
 
+_MEASURED_UNITS = {CHECKSUMS: "ms of loading"}
 _COLOUR_MAPPED = ("intensity", "elevation", "level")
 
 
@@ -43,7 +45,7 @@ class Part:
 def parts(job: Job, work: Workload, decision: Decision) -> list[Part]:
     """All parts, left out or kept, of a run with this topology and an average frame like this."""
     return [
-        _mpi(work, decision),
+        _mpi(decision),
         _compositing(work),
         _back_face_test(job, work),
         _level_of_detail(job, work),
@@ -66,14 +68,21 @@ def left_out(job: Job, work: Workload, decision: Decision) -> list[dict[str, Any
     return [part.as_dict() for part in parts(job, work, decision) if part.left_out]
 
 
-def _mpi(work: Workload, decision: Decision) -> Part:
-    gain_s = COSTS.message_s
-    if decision.estimate is not None:
-        gain_s = abs(decision.estimate.pipelined_s - decision.estimate.single_s)
+def with_measured(found: Iterable[Part], saved_ms: Mapping[str, float]) -> list[Part]:
+    """The parts with what an ablation measured, milliseconds by part, instead of what was predicted."""
+    return [
+        replace(part, gain=saved_ms[part.what], unit=_MEASURED_UNITS.get(part.what, "ms/frame"), basis="measured")
+        if part.what in saved_ms and part.basis == "predicted"
+        else part
+        for part in found
+    ]
+
+
+def _mpi(decision: Decision) -> Part:
     single = decision.topology == "single"
-    if not single and decision.estimate is not None:
-        gain_s = -gain_s
-    return Part(MPI, single, decision.reason, gain_s * 1e3, "ms/frame")
+    if decision.estimate is None:
+        return Part(MPI, single, decision.reason, COSTS.message_s * 1e3, "ms/frame")
+    return Part(MPI, single, decision.reason, -decision.estimate.saved_s, "s/run")
 
 
 def _compositing(work: Workload) -> Part:

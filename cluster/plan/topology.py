@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass
 from typing import Literal
 
 from ...nodes.raster.choose import resolve_rasterizer
+from ...shared.messages import RENDER_POINT
 from ..job import Job
 from ..launch import mpi_available
 from .workload import Workload
@@ -23,27 +24,37 @@ Topology = Literal["single", "pipelined"]
 
 @dataclass(frozen=True)
 class UnitCosts:
-    """Seconds of one core for a unit of work, fitted to runs on 2 cores of an AMD EPYC (Zen 3, no GPU).
+    """Seconds of one core for a unit of work, from runs on 2 cores of an AMD EPYC without a GPU.
 
-    They decide only what cannot be tried without loading the points: another machine's clock scales them together,
-    and culling and sampling are timed where the run starts.
+    They stand only for what cannot be tried without loading the points: culling and sampling are timed where the run
+    starts. Another machine's clock scales them together, which moves no decision.
+
+    point_s, square_s : drawing a point of one pixel, of 3×3.  pixel_s : clearing and merging a framebuffer word.
+    entry_s : of a render-points entry, before the threads start.
+    gl_point_s : of a GPU, which takes no core; not measured.  picture_s, png_s, mp4_s : of a pixel.
+    message_s, message_byte_s : a frame's messages and waits, each of their bytes.
+    start_s : three ranks instead of one, until the first frame.
+    back_face_s, lod_s : of a cell.  flatness_s : of a point, when building.  checksum_s : of a byte.
+    opengl_s, colour_maps_s : import, and for OpenGL a context.
     """
 
     point_s: float = 4e-9
     square_s: float = 13e-9
     pixel_s: float = 1.5e-9
+    entry_s: float = 0.2e-6
     gl_point_s: float = 0.5e-9
     picture_s: float = 3e-9
-    png_s: float = 25e-9
-    mp4_s: float = 25e-9
+    png_s: float = 34e-9
+    mp4_s: float = 29e-9
     message_s: float = 0.5e-3
+    message_byte_s: float = 1e-9
     start_s: float = 2.0
     back_face_s: float = 5e-9
     lod_s: float = 5e-9
     flatness_s: float = 30e-9
     checksum_s: float = 1e-9
     opengl_s: float = 0.3
-    colour_maps_s: float = 0.2
+    colour_maps_s: float = 0.1
 
 
 COSTS = UnitCosts()
@@ -53,15 +64,18 @@ COSTS = UnitCosts()
 class Estimate:
     """Seconds of an average frame by topology, and what they are made of.
 
-    parallel_s : of the render stage, spread over its threads.  busy_s : work of all stages and encoders, on one core.
+    busy_s : work of all stages and encoders, on one core.
+    saved_s : of the whole run on three ranks instead of one, what starting them takes subtracted.
     """
 
     culling_s: float
     sampling_s: float
     render_s: float
     busy_s: float
+    message_s: float
     single_s: float
     pipelined_s: float
+    saved_s: float
     cores: int
 
 
@@ -89,25 +103,24 @@ def estimate(job: Job, work: Workload, cores: int, costs: UnitCosts = COSTS) -> 
     """What an average frame takes on one rank and on three that share ``cores``."""
     output = job.config.output
     shown = output.png or output.mp4
-    picture_s = costs.picture_s * work.pixels * shown
+    alone_s = costs.entry_s * work.entries + costs.picture_s * work.pixels * shown  # on one core, others wait
     if resolve_rasterizer(job.config.render.rasterizer) == "cpu":
         threads = min(job.config.render.threads or cores, cores)
         point_s = costs.point_s if job.largest_point_px == 1 else costs.square_s
         render_core_s = point_s * work.points + costs.pixel_s * work.pixels
-        render_s = render_core_s / threads + picture_s
+        render_s = render_core_s / threads + alone_s
     else:
         render_core_s = 0.0
-        render_s = costs.gl_point_s * work.points + picture_s
+        render_s = costs.gl_point_s * work.points + alone_s
     encode_s = (costs.png_s * output.png + costs.mp4_s * output.mp4) * work.pixels
-    busy_s = work.culling_s + work.sampling_s + render_core_s + picture_s + encode_s
+    busy_s = work.culling_s + work.sampling_s + render_core_s + alone_s + encode_s
     stages = work.culling_s, work.sampling_s, render_s
-    return Estimate(
-        *stages,
-        busy_s=busy_s,
-        single_s=max(sum(stages), busy_s / cores),
-        pipelined_s=max(*stages, busy_s / cores) + costs.message_s,
-        cores=cores,
-    )
+    single_s = max(sum(stages), busy_s / cores)
+    sent_bytes = work.cells / 8 + RENDER_POINT.itemsize * work.entries
+    message_s = costs.message_s + costs.message_byte_s * sent_bytes
+    pipelined_s = max(*stages, busy_s / cores) + message_s
+    saved_s = (single_s - pipelined_s) * job.n_frames - costs.start_s
+    return Estimate(*stages, busy_s, message_s, single_s, pipelined_s, saved_s, cores)
 
 
 def choose_topology(job: Job, work: Workload, costs: UnitCosts = COSTS) -> Decision:
@@ -117,26 +130,18 @@ def choose_topology(job: Job, work: Workload, costs: UnitCosts = COSTS) -> Decis
     selection_s = found.culling_s + found.sampling_s
     said = f"culling and sampling take {_ms(selection_s)} of an estimated {_ms(found.single_s)} a frame"
     if gain_s <= 0:
-        saved_s = max(0.0, gain_s + costs.message_s)
+        saved_s = max(0.0, gain_s + found.message_s)
         return Decision(
             "single",
             f"{said}: three ranks on {found.cores} cores would save {_ms(saved_s)} "
-            f"({saved_s / found.single_s:.1%}) and spend {_ms(costs.message_s)} on messages",
+            f"({saved_s / found.single_s:.1%}) and spend {_ms(found.message_s)} on messages",
             found,
         )
-    total_s = gain_s * job.n_frames
-    if total_s <= costs.start_s:
-        return Decision(
-            "single",
-            f"{said}: three ranks would save {_ms(gain_s)} a frame, {total_s:.2g} s in {job.n_frames} frames, "
-            f"and take {costs.start_s:.2g} s longer to start",
-            found,
-        )
-    return Decision(
-        "pipelined",
-        f"{said}: three ranks need {_ms(found.pipelined_s)}, which saves {total_s:.2g} s in {job.n_frames} frames",
-        found,
-    )
+    total = f"{_ms(gain_s)} a frame, {gain_s * job.n_frames:.2g} s in {job.n_frames} frames"
+    if found.saved_s <= 0:
+        why = f"{said}: three ranks would save {total}, and take {costs.start_s:.2g} s longer to start"
+        return Decision("single", why, found)
+    return Decision("pipelined", f"{said}: three ranks save {total}, and take {costs.start_s:.2g} s to start", found)
 
 
 def decide(job: Job) -> Decision:
@@ -153,4 +158,5 @@ def decide(job: Job) -> Decision:
 
 
 def _ms(seconds: float) -> str:
-    return f"{seconds * 1e3:.2g} ms"
+    milliseconds = seconds * 1e3
+    return f"{milliseconds:.0f} ms" if milliseconds >= 10 else f"{milliseconds:.2g} ms"
