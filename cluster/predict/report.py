@@ -69,7 +69,7 @@ def add_ranks(report: Report, splits: Sequence[Split]) -> None:
 
 
 def add_comparisons(report: Report, comparisons: Sequence[Comparison]) -> None:
-    """Predicted beside measured, sorted by nothing: in the order of the experiment."""
+    """Predicted beside measured, in the order of the experiment."""
     median, worst = errors(comparisons)
     verdict = "within" if median <= MEDIAN_GOAL and worst <= WORST_GOAL else "outside"
     report.heading("Predicted beside measured")

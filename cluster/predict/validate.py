@@ -37,7 +37,7 @@ def compare(
 ) -> tuple[list[Comparison], dict[str, Costs]]:
     """Every one of the first ``n_points`` points against the costs of its scene; the costs by scene.
 
-    The others are calibration. A calibration run whose settings are those of a compared point is not used for it.
+    The others are calibration: other settings than any of the compared points (``calibrate.extended``).
     """
     costs: dict[str, Costs] = {}
     out = []
