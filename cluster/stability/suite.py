@@ -19,6 +19,7 @@ MODULES = (
     "splatpipe.nodes.stability.depth",
     "splatpipe.nodes.stability.clouds",
     "splatpipe.nodes.stability.viewports",
+    "splatpipe.nodes.stability.opengl",
     "splatpipe.nodes.stability.large",
     "splatpipe.shared.stability.eigenvalues",
     "splatpipe.shared.stability.cameras",

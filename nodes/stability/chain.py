@@ -26,6 +26,10 @@ from ..sampling import SamplingNode
 _POINT = np.dtype([("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("red", "u1"), ("green", "u1"), ("blue", "u1")])
 ALPHA = np.uint32(255 << 24)
 
+STEPS = 4.0
+"""Bound of an image position in float32 steps of what it is added up from (``Chain.moved_steps``): a row is four
+products and three sums, divided by another such row; most of its roundings are of small parts."""
+
 
 @dataclass(frozen=True)
 class Chain:
@@ -141,9 +145,27 @@ def built(positions: np.ndarray, *, order: str = "layered", points_per_cell: int
     with tempfile.TemporaryDirectory(prefix="splatpipe-stability-") as folder:
         file, out = Path(folder) / "points.npy", Path(folder) / "scene"
         np.save(file, records)
-        settings = BuildSettings(point_order=order, points_per_cell=points_per_cell, memory_bytes=4 << 30)
+        settings = BuildSettings(point_order=order, points_per_cell=points_per_cell)
         build_scene([open_source(file)], out, settings=settings)
         yield Chain(np.asarray(positions, np.float64), Scene.open(out))
+
+
+def in_one_block(positions: np.ndarray, colour: np.ndarray | None = None) -> ResidentPoints:
+    """(n, 3) positions, rounded to float32, in one block at the origin; colours number them where none are given."""
+    x, y, z = np.ascontiguousarray(np.asarray(positions).T, np.float32)
+    colour = np.arange(len(x)) if colour is None else colour
+    return ResidentPoints(x, y, z, colour.astype(np.uint32), np.zeros(1, np.int64), np.zeros((1, 3)))
+
+
+def draw_all(points: ResidentPoints, camera: Camera) -> np.ndarray:
+    """(height, width) words of a frame of all points, drawn by ``cpu``."""
+    with CpuRasterizer(points, camera.width, camera.height, threads=2) as rasterizer:
+        return rasterizer.draw(camera, every_point(points))
+
+
+def every_point(points: ResidentPoints) -> np.ndarray:
+    """The entry that draws all points."""
+    return np.array([(0, len(points), 1)], RENDER_POINT)
 
 
 def camera_at(

@@ -13,7 +13,7 @@ from ..culling import CullingNode
 from ..raster import ResidentPoints
 from ..raster.cpu import CpuRasterizer
 from ..sampling import SamplingNode
-from .chain import Chain, built, camera_at, is_drawn
+from .chain import STEPS, Chain, built, camera_at, is_drawn
 
 
 def _random(n: int, *scales: float) -> np.ndarray:
@@ -78,6 +78,16 @@ def drawn(name: str) -> float:
             expect(np.array_equal(np.sort(stored), np.arange(len(positions))), "every point is in one leaf, once")
             wrong += sum(chain.differing_pixels(camera) for camera in _cameras(positions))
     return wrong
+
+
+@cases("cloud/projected", bounds=dict.fromkeys(CLOUDS, STEPS), unit="float32 steps")
+def projected(name: str) -> float:
+    """Image position of every drawn point, from outside and from within, against float64 of the points as given."""
+    positions = CLOUDS[name]()
+    with built(positions) as chain:
+        moved = np.concatenate([chain.moved_steps(camera) for camera in _cameras(positions)])
+        expect(len(moved), "points are in the image")
+        return float(moved.max())
 
 
 @cases("cloud/cut", bounds=_EVERY, unit="leaves")

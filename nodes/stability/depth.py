@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from ...shared.camera import Camera
-from ...shared.messages import FRAMEBUFFER_EMPTY, RENDER_POINT
+from ...shared.messages import FRAMEBUFFER_EMPTY
 from ...shared.stability.case import case, cases, expect
 from ..raster import ResidentPoints
-from ..raster.cpu import CpuRasterizer
 from ..raster.reference import project_float32, reference_frame
-from .chain import Chain, built, camera_at, city
+from .chain import STEPS, Chain, built, camera_at, city, draw_all, every_point, in_one_block
 
 _WIDTH, _HEIGHT = 480, 270
 
@@ -20,23 +19,9 @@ def _along_x(near: float) -> Camera:
     return camera_at(np.zeros(3), np.array([1.0, 0.0, 0.0]), width=_WIDTH, height=_HEIGHT, near=near)
 
 
-def _resident(xyz: np.ndarray, colour: np.ndarray) -> ResidentPoints:
-    """(n, 3) positions in one block at the origin."""
-    x, y, z = np.ascontiguousarray(xyz.T, np.float32)
-    return ResidentPoints(x, y, z, colour.astype(np.uint32), np.zeros(1, np.int64), np.zeros((1, 3)))
-
-
-def _draw(points: ResidentPoints, camera: Camera, entries: np.ndarray | None = None) -> np.ndarray:
-    if entries is None:
-        entries = np.array([(0, len(points), 1)], RENDER_POINT)
-    with CpuRasterizer(points, camera.width, camera.height, threads=2) as rasterizer:
-        return rasterizer.draw(camera, entries).copy()
-
-
-@case("depth/one float32 step apart", bound=0.0, unit="pixels")
-def one_step() -> float:
-    """Pixels that do not show the nearer of two points one float32 step apart, at 100 000 depths from 1e-3 to 1e7, each
-    in a pixel of its own, the farther one drawn first and last.
+def pairs_one_step_apart() -> tuple[ResidentPoints, Camera, int]:
+    """100 000 pairs of points one float32 step apart, at depths from 1e-3 to 1e7, each pair in a pixel of its own, the
+    farther point first and last; the camera; the number of pairs. The nearer one has colour 1.
     """
     n = 100_000
     depth = np.geomspace(1e-3, 1e7, n).astype(np.float32)
@@ -46,9 +31,23 @@ def one_step() -> float:
     sideways = (column - _WIDTH / 2) / camera.focal_px, (row - _HEIGHT / 2) / camera.focal_px
     farther = np.nextafter(depth, np.float32(np.inf))
     layers = [np.column_stack([d, -sideways[0] * d, -sideways[1] * d]) for d in (farther, depth, farther)]
-    frame = _draw(_resident(np.concatenate(layers), np.repeat([2, 1, 2], n)), camera).ravel()
-    expect((frame[:n] != FRAMEBUFFER_EMPTY).all() and (frame[n:] == FRAMEBUFFER_EMPTY).all(), "one pixel a pair")
-    return int((frame[:n] & np.uint64(0xFFFFFFFF) != 1).sum())
+    return in_one_block(np.concatenate(layers), np.repeat([2, 1, 2], n)), camera, n
+
+
+def not_the_nearer(frame: np.ndarray, n: int) -> int:
+    """Pixels of those pairs that show the farther point."""
+    words = frame.ravel()
+    expect((words[:n] != FRAMEBUFFER_EMPTY).all() and (words[n:] == FRAMEBUFFER_EMPTY).all(), "one pixel a pair")
+    return int((words[:n] & np.uint64(0xFFFFFFFF) != 1).sum())
+
+
+@case("depth/one float32 step apart", bound=0.0, unit="pixels")
+def one_step() -> float:
+    """Pixels that do not show the nearer of two points one float32 step apart, at 100 000 depths from 1e-3 to 1e7, each
+    in a pixel of its own, the farther one drawn first and last.
+    """
+    points, camera, n = pairs_one_step_apart()
+    return not_the_nearer(draw_all(points, camera), n)
 
 
 @case("depth/1e-3 to 1e7 m", bound=0.0, unit="pairs")
@@ -98,7 +97,7 @@ def near_plane() -> float:
     for near in (1e-30, 1e-3, 1.0, 1000.0, 1e30):
         at = np.float32(near)
         for depth, kept in ((np.nextafter(at, np.float32(0)), 0), (at, 1), (np.nextafter(at, np.float32(np.inf)), 1)):
-            frame = _draw(_resident(np.array([[depth, 0.0, 0.0]]), np.ones(1)), _along_x(float(at)))
+            frame = draw_all(in_one_block(np.array([[depth, 0.0, 0.0]])), _along_x(float(at)))
             wrong += abs(int((frame != FRAMEBUFFER_EMPTY).sum()) - kept)
     return wrong
 
@@ -116,21 +115,16 @@ def towards_zero() -> float:
     xyz[near_the_axis, 1:] = depth[near_the_axis, None] * rng.uniform(-0.5, 0.5, (int(near_the_axis.sum()), 2))
     xyz[::1000] = np.inf
     xyz[1::1000, 0] = np.nan
-    points, camera = _resident(xyz, rng.integers(0, 1 << 24, len(xyz))), _along_x(near=1e-38)
-    entries = np.array([(0, len(points), 1)], RENDER_POINT)
-    frame = _draw(points, camera)
+    points, camera = in_one_block(xyz), _along_x(near=1e-38)
+    frame = draw_all(points, camera)
     with np.errstate(all="ignore"):
-        wrong = int((frame != reference_frame(points, camera, entries, projection=project_float32)).sum())
+        wrong = int((frame != reference_frame(points, camera, every_point(points), projection=project_float32)).sum())
     drawn = (frame[frame != FRAMEBUFFER_EMPTY] >> np.uint64(32)).astype(np.uint32).view(np.float32)
     expect(len(drawn) > 1000, "points are in the image")
     return wrong + int((~np.isfinite(drawn) | (drawn < np.float32(1e-38))).sum())
 
 
-_STEPS = 4.0
-"""A row is four products and three sums, divided by another such row; most of its roundings are of small parts."""
-
-
-@case("camera/on a point", bound=_STEPS, unit="float32 steps")
+@case("camera/on a point", bound=STEPS, unit="float32 steps")
 def on_a_point() -> float:
     """Image position of every drawn point, against float64, with the eye exactly on 20 of the points of a city (near
     plane at 5 cm), and no pixel that differs from brute force; 1920×1080.
@@ -157,7 +151,7 @@ def _close_views(chain: Chain, distance: float, near: float) -> list[Camera]:
     return [camera_at(eye, point, near=near) for eye, point in zip(eyes, points, strict=True)]
 
 
-@cases("camera/inside a cell of", bounds=dict.fromkeys(_CELLS, _STEPS), unit="float32 steps")
+@cases("camera/inside a cell of", bounds=dict.fromkeys(_CELLS, STEPS), unit="float32 steps")
 def inside_a_cell(points_per_cell: int) -> float:
     """Image position of every drawn point, against float64, from 50 eyes inside cells of at most this many points,
     6 cm from a point; 1920×1080. With 30 000 the whole city is one cell of 200 m.
