@@ -261,6 +261,9 @@ def predict(
         bool, typer.Option("--validate", help="Predicted beside measured, over an experiment.")
     ] = False,
     fresh: Annotated[bool, typer.Option("--fresh", help="Measure again instead of using what is there.")] = False,
+    best: Annotated[
+        bool, typer.Option("--best", help="Of each setting the fastest repeat: for a machine that others work on.")
+    ] = False,
     json: JsonOption = None,
 ) -> None:
     """Frames/s, latency and bottleneck of other settings, cores and ranks, from costs fitted on a few measured runs.
@@ -270,9 +273,11 @@ def predict(
     from .predict.command import predict_command, validate_command
 
     if validate:
-        validate_command(config, fresh=fresh, json_path=json)
+        validate_command(config, fresh=fresh, best=best, json_path=json)
     else:
-        predict_command(config, sets or [], what_if or [], ranks, repeats, output, fresh=fresh, json_path=json)
+        predict_command(
+            config, sets or [], what_if or [], ranks, repeats, output, fresh=fresh, best=best, json_path=json
+        )
 
 
 @bench_app.command("raster")

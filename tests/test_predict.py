@@ -383,6 +383,28 @@ def test_predicted_beside_measured(config, tmp_path):
     assert "4 settings: median error" in (tmp_path / "out" / "predicted.md").read_text()
 
 
+def test_the_fastest_repeats_are_not_disturbed(config, tmp_path):
+    calls = []
+
+    def disturbed(config, sets):
+        record = fake_run(config, sets)
+        calls.append(record)
+        slower = 1.0 if len(calls) > 8 else 3.0  # some of the first repeats
+        lists = {name: [slower * s for s in seconds] for name, seconds in record["per_frame"].items()}
+        return record | {"frames_per_s": record["frames_per_s"] / slower, "per_frame": lists}
+
+    file = tmp_path / "e.toml"
+    file.write_text(
+        f'[experiment]\nbase = "{config}"\noutput = "out"\nrepeats = 2\n[grid]\n"render.threads" = [1, 2]\n'
+        '[set]\n"pipeline.topology" = "single"\n'
+    )
+    errors = {}
+    for best in (False, True):
+        validate_command(file, best=best, json_path=tmp_path / "r.json", runner=disturbed)
+        errors[best] = json.loads((tmp_path / "r.json").read_text())["worst_error"]
+    assert errors[True] < 0.02 < errors[False]
+
+
 def test_a_rasterizer_without_a_model_is_refused(config, tmp_path):
     with pytest.raises(InputError, match=r"render\.rasterizer = 'gl', expected cpu"):
         predict_command(config, ["render.rasterizer=gl"], [], 8, 1, tmp_path, runner=fake_run)

@@ -88,12 +88,17 @@ def extended(experiment: Experiment) -> Experiment:
     return replace(experiment, points=points, runs=runs)
 
 
-def measured_points(experiment: Experiment, journal: Journal) -> dict[int, Measured]:
-    """Point → what was measured there; points that never succeeded are missing."""
+def measured_points(experiment: Experiment, journal: Journal, *, best: bool = False) -> dict[int, Measured]:
+    """Point → what was measured there; points that never succeeded are missing.
+
+    best : only the fastest repeat, for a machine that others work on: what they take only ever slows a run down.
+    """
     records: dict[int, list[dict[str, Any]]] = {}
     for run in journal.runs:
         if run.record is not None:
             records.setdefault(run.point, []).append(run.record)
+    if best:
+        records = {i: [max(done, key=lambda record: record["frames_per_s"])] for i, done in records.items()}
     loads: dict[str, Workload] = {}
     out = {}
     for i, done in sorted(records.items()):

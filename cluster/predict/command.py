@@ -22,7 +22,7 @@ from .calibrate import all_costs, calibration_experiment, extended, measured_poi
 from .costs import Measured
 from .forecast import Forecast, Machine
 from .hybrid import Split, scaling
-from .report import ASSUMPTIONS, add_comparisons, add_costs, add_forecasts, add_ranks
+from .report import ASSUMPTIONS, BEST, add_comparisons, add_costs, add_forecasts, add_ranks
 from .validate import compare, errors
 from .whatif import Case, changed
 from .workload import count_workload
@@ -33,7 +33,7 @@ LAYOUTS = (("single", 1), ("single", 0), ("pipelined", 1), ("pipelined", 0))
 
 def predict_command(
     config: Path, overrides: list[str], what_if: list[str], ranks: int, repeats: int, output: Path, *,
-    fresh: bool = False, json_path: Path | None = None, runner: Runner = measured_run,
+    fresh: bool = False, best: bool = False, json_path: Path | None = None, runner: Runner = measured_run,
 ) -> None:  # fmt: skip
     """Predict frames/s of a run configuration as it is, laid out otherwise, changed, and on ``ranks`` ranks."""
     job = Job(load_config(config, overrides))
@@ -43,7 +43,7 @@ def predict_command(
             f"{config}: render.rasterizer = {job.config.render.rasterizer!r}, expected cpu: no other model"
         )
     experiment = calibration_experiment(config, overrides, output / "calibration", repeats)
-    costs = all_costs(list(_measure(experiment, fresh, runner).values()), machine)
+    costs = all_costs(list(_measure(experiment, fresh, best, runner).values()), machine)
     case = Case(job.config, costs, count_workload(job), machine, job.scene.info.n_points)
     forecasts = [("as configured", case.predict())]
     for topology, threads in LAYOUTS:
@@ -53,7 +53,7 @@ def predict_command(
     splits = scaling(costs, case.load, machine, ranks)
 
     report = Report(f"What {config.stem} would do", f"splatpipe predict {config.name}")
-    report.text(ASSUMPTIONS)
+    report.text(ASSUMPTIONS + (BEST if best else ""))
     report.heading("Forecasts")
     add_forecasts(report, forecasts)
     add_ranks(report, splits)
@@ -77,18 +77,18 @@ def predict_command(
 
 
 def validate_command(
-    file: Path, *, fresh: bool = False, json_path: Path | None = None, runner: Runner = measured_run
+    file: Path, *, fresh: bool = False, best: bool = False, json_path: Path | None = None, runner: Runner = measured_run
 ) -> None:
     """Run an experiment and the calibration of its scenes, interleaved; say how far the predictions were off."""
     own = load_experiment(file)
     experiment = extended(own)
-    measured = _measure(experiment, fresh, runner)
+    measured = _measure(experiment, fresh, best, runner)
     machine = Machine(cores=len(os.sched_getaffinity(0)))
     comparisons, costs = compare(experiment, measured, len(own.points), machine)
     report = Report(
         f"Predicted and measured: {own.config.experiment.title}", f"splatpipe predict --validate {file.name}"
     )
-    report.text(ASSUMPTIONS)
+    report.text(ASSUMPTIONS + (BEST if best else ""))
     add_comparisons(report, comparisons)
     for scene, found in costs.items():
         add_costs(report, found, Path(scene).stem)
@@ -102,12 +102,12 @@ def validate_command(
         write_json(json_path, {"comparisons": rows, "median_error": median, "worst_error": worst})
 
 
-def _measure(experiment: Experiment, fresh: bool, runner: Runner) -> dict[int, Measured]:
+def _measure(experiment: Experiment, fresh: bool, best: bool, runner: Runner) -> dict[int, Measured]:
     """Run what is missing of an experiment; what was measured. A point that failed is an error here."""
     journal = run_experiment(experiment, fresh=fresh, runner=runner)
     for point, why in journal.failures.items():
         raise SplatpipeError(f"point {point + 1} failed: {why}")
-    return measured_points(experiment, journal)
+    return measured_points(experiment, journal, best=best)
 
 
 def _plain(name: str, found: Forecast) -> dict[str, Any]:

@@ -20,6 +20,8 @@ ASSUMPTIONS = (
     "encoding pictures and films is not predicted. Message bytes travel at an assumed 10 GB/s unless told otherwise."
 )
 
+BEST = " Of each setting the fastest repeat counts: the machine was shared, and what others take only ever slows a run."
+
 
 def add_costs(report: Report, costs: Costs, name: str = "") -> None:
     """The fitted costs with their residuals."""
