@@ -224,6 +224,16 @@ def test_a_file_alone_is_evaluated_and_reported(tmp_path):
         assert "not applicable" in text
 
 
+def test_a_link_without_bandwidth_is_reported_as_never_in_time(tmp_path):
+    path = tmp_path / "stuck.toml"
+    path.write_text((SYSTEMS / "1920x1200-gigabit.toml").read_text().replace("= 125000000.0", "= 0"))
+    model = make_model(None, [], path, None, None)
+    sending = [c for c in record(model)["conditions"] if c["number"] == "2"]
+    assert [(c["verdict"], c["needed_s"], c["largest_frames_per_s"]) for c in sending] == [("violated", "inf", 0)] * 2
+    text = make_report(model, "test").write(tmp_path / "stuck")[1].read_text()
+    assert "at most 0 frames/s" in text
+
+
 def test_the_report_gives_every_parameter_its_unit_and_source():
     model = make_model(None, [], THESIS, None, None)
     tables = [part for part in make_report(model, "test").parts if hasattr(part, "columns")]

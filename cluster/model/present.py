@@ -17,6 +17,9 @@ from .errata import COLUMNS, ERRATA
 from .inequalities import Condition, bottleneck
 from .parameters import Quantity, parameters
 
+_PLOTTED_MS = (1e-9, 1e12)
+"""Times beyond these are drawn at the edge: for ever has to stand somewhere."""
+
 _COLUMNS = ("", "condition", "where", "needed ms", "1/F ms", "margin ms", "verdict", "largest F", "largest D", "unit")
 
 
@@ -104,20 +107,29 @@ def _run_text(model: Model) -> str:
 
 
 def _figure(model: Model) -> Any:
-    """Bars of the time needed, on a logarithmic axis; violated ones stand out."""
+    """A dot for the time that each condition needs, on a logarithmic axis; violated ones stand out."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import NullFormatter
 
-    shown = [c for c in reversed(model.conditions) if c.need is not None and 0 < c.need.seconds < math.inf]
+    shown = [c for c in reversed(model.conditions) if c.need is not None and c.need.seconds > 0]
     figure = Figure(figsize=(8, 0.6 + 0.28 * len(shown)))
     axes = figure.subplots()
-    times = [c.need.seconds * 1e3 for c in shown if c.need is not None]
+    times = [_within_plot(c.need.seconds * 1e3) for c in shown if c.need is not None]
+    budget_ms = _within_plot(1e3 / model.application.frames_per_s)
     colours = ["#c0392b" if c.verdict == "violated" else "#4a7fb5" for c in shown]
-    axes.barh([f"({c.number}) {c.what}, {c.where}" for c in shown], times, color=colours)
-    axes.axvline(1e3 / model.application.frames_per_s, color="black", linewidth=1)
+    axes.scatter(times, [f"({c.number}) {c.what}, {c.where}" for c in shown], c=colours, s=40, zorder=2)
+    axes.axvline(budget_ms, color="black", linewidth=1)
     axes.set_xscale("log")
-    axes.set_xlabel(f"ms a frame; 1/F = {1e3 / model.application.frames_per_s:.4g} ms")
-    axes.grid(axis="x", alpha=0.3)
+    decades = [math.log10(t) for t in (*times, budget_ms)]
+    axes.set_xlim(10.0 ** math.floor(min(decades)), 10.0 ** math.ceil(max(decades) + 0.1))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.set_xlabel(f"ms a frame; 1/F = {budget_ms:.4g} ms")
+    axes.grid(alpha=0.3)
     return figure
+
+
+def _within_plot(ms: float) -> float:
+    return min(max(ms, _PLOTTED_MS[0]), _PLOTTED_MS[1])
 
 
 def _rows(model: Model) -> list[list[Any]]:
