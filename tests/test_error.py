@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from splatpipe.cluster import cli
 from splatpipe.cluster.error import scene as swept_scene
 from splatpipe.cluster.error import sweep
-from splatpipe.cluster.error.config import ImageSection, load_error_config
+from splatpipe.cluster.error.config import ImageSection, load_error_config, sweep_points
 from splatpipe.cluster.error.picture import decode_picture, encode_picture
 from splatpipe.cluster.error.reference import POINTS_AT_A_TIME, _pieces
 from splatpipe.cluster.error.report import pareto_front
@@ -64,7 +64,7 @@ values = [4, 8, 16]
 method = "jpeg"
 key = "image.jpeg_quality"
 values = [30, 95]
-set = { "image.codec" = "jpeg" }
+set = { image.codec = "jpeg" }
 [[sweep]]
 method = "rasterizer"
 key = "render.rasterizer"
@@ -311,7 +311,7 @@ def test_every_shipped_file_is_valid(path):
         ("values = [0, 4, 8, 16]", "values = []", "sweep.0.values = []"),
         ('"render.rasterizer"', '"camera.width"', "sweep 'rasterizer': camera.width cannot be swept"),
         ('"render.rasterizer"', '"render.colour"', "sweep 'rasterizer': render.colour cannot be swept"),
-        ('"image.codec"', '"image.codek"', "unknown key image.codek, did you mean image.codec?"),
+        ("image.codec", "image.codek", "unknown key image.codek, did you mean image.codec?"),
         ("[4, 8, 16]", "[4, 25]", "positions.bits_per_axis = 25"),
         ('"depth-first"', '"breadth-first"', "sweep.1.order = 'breadth-first'"),
         ('method = "stride"', 'method = "layered"', "sweep 'layered' occurs twice"),
@@ -329,6 +329,17 @@ def test_what_is_wrong_is_said_in_one_line_with_status_2(config, replace, by, sa
     assert said in message
     assert len(message.strip().splitlines()) == 1
     assert not (config.parent / "out").exists()
+
+
+def test_a_setting_of_a_scene_or_a_sweep_leaves_the_rest_of_its_section_alone(config):
+    text = config.read_text().replace("[[sweep]]", 'set = { camera.width = 64, "camera.fov_deg" = 30 }\n[[sweep]]', 1)
+    config.write_text(text)
+    loaded = load_error_config(config)
+    points = list(sweep_points(loaded, loaded.scene[0], "x"))
+    jpeg = [point.config for point in points if point.method == "jpeg"]
+    assert [(c.image.codec, c.image.jpeg_quality) for c in jpeg] == [("jpeg", 30), ("jpeg", 95)]
+    assert {(c.camera.width, c.camera.height, c.camera.fov_deg) for c in jpeg} == {(64, 72, 30.0)}
+    assert {c.sampling.pixel_threshold for c in jpeg} == {0}
 
 
 def test_a_missing_file_and_a_file_without_a_sweep_are_refused(tmp_path):

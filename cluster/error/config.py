@@ -76,7 +76,7 @@ class ErrorConfig(Section):
     sweep: Annotated[list[SweepEntry], Field(min_length=1)]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SweepPoint:
     """One point of one method on one scene."""
 
@@ -109,7 +109,7 @@ def load_error_config(path: Path) -> ErrorConfig:
 
 def base_config(config: ErrorConfig, scene: SceneEntry, source: str) -> PointConfig:
     """The run that the reference of a scene is drawn for."""
-    return _changed(config.run, {"scene.path": scene.path, **scene.set}, f"{source}: scene {scene.name!r}")
+    return _changed(config.run, {"scene.path": scene.path, **_flat(scene.set)}, f"{source}: scene {scene.name!r}")
 
 
 def sweep_points(config: ErrorConfig, scene: SceneEntry, source: str) -> Iterator[SweepPoint]:
@@ -117,15 +117,24 @@ def sweep_points(config: ErrorConfig, scene: SceneEntry, source: str) -> Iterato
     base = base_config(config, scene, source)
     for sweep in config.sweep:
         where = f"{source}: sweep {sweep.method!r}"
-        for key in (sweep.key, *sweep.set):
+        settled = _flat(sweep.set)
+        for key in (sweep.key, *settled):
             section = key.partition(".")[0]
             if key in REFERENCE_KEYS or (section in RunConfig.model_fields and section not in SWEPT_SECTIONS):
                 raise ConfigError(
                     f"{where}: {key} cannot be swept, expected a key that leaves camera, scene and colour"
                 )
         for value in sweep.values:
-            changed = _changed(base, {**sweep.set, sweep.key: value}, where)
+            changed = _changed(base, {**settled, sweep.key: value}, where)
             yield SweepPoint(scene.name, sweep.method, sweep.key, value, sweep.order, changed)
+
+
+def _flat(tables: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """``section.key`` → value: TOML makes tables of dotted keys that are not quoted."""
+    flat: dict[str, Any] = {}
+    for key, value in tables.items():
+        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
+    return flat
 
 
 def _changed(config: PointConfig, values: dict[str, Any], source: str) -> PointConfig:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,9 @@ class Omission:
     why: str
 
 
+ROUNDS = 3
+"""Times that the first pass goes over all points of a scene."""
+
 NOT_BUILT = (
     Omission("splat modes (visibility pass, Gaussian blending, feature-driven)", "not built yet"),
     Omission("codecs (transformation streams, cell identification, linear groups)", "not built yet"),
@@ -60,37 +63,62 @@ def run_sweep(config: ErrorConfig, source: str, progress: FrameProgress) -> Swee
     omissions: dict[Omission, None] = {}  # an ordered set
     for scene in [SweptScene(config, entry, source) for entry in config.scene]:
         scene.prepare(progress)
-        timed: list[tuple[SweepPoint, dict[str, Any]]] = []
-        for i, point in enumerate(scene.points):
-            progress.show(f"{scene.name}: timing {point.method}", i, len(scene.points))
-            try:
-                timed.append((point, _times(scene, point, config.repeats)))
-            except DeviceError as error:
-                omissions[Omission(f"{point.method}: {point.key} = {point.value}", str(error))] = None
+        timed, not_drawn = _time_points(scene, config.repeats, progress)
+        omissions |= dict.fromkeys(not_drawn)
         references = scene.references(progress)
-        for i, (point, times) in enumerate(timed):
+        for i, (point, times) in enumerate(timed.items()):
             progress.show(f"{scene.name}: errors of {point.method}", i, len(timed))
-            rows.append(times | _errors(scene, point, references))
+            rows.append(_time_row(scene, point, times) | _errors(scene, point, references))
             omissions |= dict.fromkeys(_without_value(rows[-1]))
     return Sweep(rows, [*omissions, *NOT_BUILT])
 
 
-def _times(scene: SweptScene, point: SweepPoint, repeats: int) -> dict[str, Any]:
-    """First pass: mean time of a frame over the cameras, its median and spread over the repeats; milliseconds.
+@dataclass
+class _Times:
+    """Seconds of one point: (camera, stage) of each pass, and encoding of each picture.  device : what drew."""
 
-    The time to encode a picture stands beside it, not in it.
-    """
+    passes: list[list[list[float]]] = field(default_factory=list)
+    encode: list[float] = field(default_factory=list)
+    device: str = ""
+
+
+def _time_points(
+    scene: SweptScene, repeats: int, progress: FrameProgress
+) -> tuple[dict[SweepPoint, _Times], list[Omission]]:
+    """First pass. The repeats of a point are spread over ``ROUNDS``, so that a slow moment of the machine meets all."""
+    timed = {point: _Times() for point in scene.points}
+    not_drawn = []
+    for n in range(ROUNDS):
+        for i, point in enumerate(scene.points):
+            progress.show(f"{scene.name}: timing {point.method}", n * len(scene.points) + i, ROUNDS * len(scene.points))
+            share = repeats * (n + 1) // ROUNDS - repeats * n // ROUNDS
+            if share and point in timed:
+                try:
+                    _time_point(scene, point, share, timed[point])
+                except DeviceError as error:
+                    not_drawn.append(Omission(f"{point.method}: {point.key} = {point.value}", str(error)))
+                    del timed[point]
+    return timed, not_drawn
+
+
+def _time_point(scene: SweptScene, point: SweepPoint, repeats: int, times: _Times) -> None:
     with scene.open(point) as pipeline:
         pictures = [_rgb(pipeline.draw(camera)[2], scene) for camera in scene.cameras]  # warms up, too
-        stage_s = np.array([[pipeline.timed_draw(camera) for camera in scene.cameras] for _ in range(repeats)])
-        encode_picture(pictures[0], point.config.image)  # warms up
-        encode_s = []
-        for picture in pictures:
-            started = time.perf_counter()
-            encode_picture(picture, point.config.image)
-            encode_s.append(time.perf_counter() - started)
-        device = pipeline.render.description
-    of_pass = stage_s.mean(axis=1)
+        times.passes += [[pipeline.timed_draw(camera) for camera in scene.cameras] for _ in range(repeats)]
+        times.device = pipeline.render.description
+    encode_picture(pictures[0], point.config.image)  # warms up
+    for picture in pictures:
+        started = time.perf_counter()
+        encode_picture(picture, point.config.image)
+        times.encode.append(time.perf_counter() - started)
+
+
+def _time_row(scene: SweptScene, point: SweepPoint, times: _Times) -> dict[str, Any]:
+    """What a point is, and its times: mean of a frame over the cameras, median and spread over the repeats.
+
+    The time to encode a picture stands beside it, not in it. Milliseconds.
+    """
+    of_pass = np.array(times.passes).mean(axis=1)  # (repeats, stages)
     frame = spread_ms(of_pass.sum(axis=1).tolist())
     return {
         "scene": scene.name,
@@ -98,16 +126,16 @@ def _times(scene: SweptScene, point: SweepPoint, repeats: int) -> dict[str, Any]
         "key": point.key,
         "value": point.value,
         "order": scene.order_of(point),
-        "rasterizer": device,
+        "rasterizer": times.device,
         "width": point.config.camera.width,
         "height": point.config.camera.height,
         "frames": len(scene.cameras),
-        "repeats": repeats,
+        "repeats": len(of_pass),
         "frame_ms": frame["median"],
         "frame_min_ms": frame["min"],
         "frame_max_ms": frame["max"],
         **{f"{name}_ms": 1e3 * float(np.median(of_pass[:, i])) for i, name in enumerate(STAGES)},
-        "encode_ms": 1e3 * float(np.median(encode_s)),
+        "encode_ms": 1e3 * float(np.median(times.encode)),
     }
 
 
