@@ -1,1 +1,18 @@
-"""Putting nodes on ranks: topologies, transport, launch, frame loop, outputs, benchmarks and the command line."""
+"""Putting nodes on ranks, and measuring what that gives.
+
+=======================  ==============================================================
+cli                      the command line: one function a command
+run, job, pipeline       a run: made ready, and its frame loop on one rank or three
+transport, launch        messages between ranks; starting ranks, and who died
+sink, progress, record   outputs; progress bars; what a run says about itself
+scenes                   build, synth, info, verify
+plan/                    what a run needs and what it leaves out; one rank or three
+model/                   the parameters and inequalities of the thesis
+predict/                 the holistic model: fitted costs, max-plus recurrence
+experiment/              grids of runs, resumable, one tidy table
+error/                   error against run time
+stability/               the suite of stiff and extreme cases
+bench/                   rasterizers, builder and pipeline beside others
+measured, report         whole runs as measurements; HTML and Markdown reports
+=======================  ==============================================================
+"""
