@@ -1,6 +1,7 @@
 """The stability suite passes: one test a case; and the suite says so when it does not."""
 
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -22,6 +23,10 @@ def test_case(case):
     assert outcome.verdict == PASSED, f"{outcome.value} {case.unit}, bound {case.bound}: {outcome.reason}"
 
 
+def named(name):
+    return next(c for c in all_cases() if c.name == name)
+
+
 def outcome_of(function, bound=1.0):
     return run(case("a/case", bound=bound, unit="px")(function))
 
@@ -37,7 +42,10 @@ def unmeasured():
 def test_a_value_that_is_no_number_an_exception_and_a_broken_premise_are_failures():
     assert outcome_of(lambda: 1.0).verdict == PASSED
     assert outcome_of(lambda: 1.0001).verdict == FAILED
-    assert outcome_of(lambda: float("nan"), bound=float("inf")).verdict == FAILED
+    for value in ("nan", "inf", "-inf"):
+        outcome = outcome_of(lambda value=value: float(value), bound=float("inf"))
+        assert (outcome.verdict, outcome.value) == (FAILED, None)
+        assert value in outcome.reason
     assert outcome_of(failing).reason == "ZeroDivisionError: division by zero"
     assert "there are points" in outcome_of(unmeasured).reason
     assert run(out_of_reach("a/case", "something", "no such thing yet")).reason == "no such thing yet"
@@ -63,6 +71,13 @@ def test_names_are_unique_and_say_something():
     assert all(c.what and "/" in c.name for c in all_cases())
 
 
+def test_cases_that_need_50_digits_are_out_of_reach_without_mpmath(monkeypatch):
+    monkeypatch.setitem(sys.modules, "mpmath", None)
+    outcome = run(named("eigen/condition 100"))
+    assert (outcome.verdict, outcome.value) == (OUT_OF_REACH, None)
+    assert "splatpipe[stability]" in outcome.reason
+
+
 def test_the_command_writes_what_it_measured_and_fails_when_a_case_does(tmp_path, monkeypatch, capsys):
     chosen = [case("a/good", bound=1.0, unit="px")(lambda: 0.5), case("a/bad", bound=1.0, unit="px")(lambda: 2.0)]
     monkeypatch.setattr(suite, "all_cases", lambda: chosen)
@@ -74,10 +89,6 @@ def test_the_command_writes_what_it_measured_and_fails_when_a_case_does(tmp_path
     assert "a/bad" in (tmp_path / "s.md").read_text()
     with pytest.raises(InputError, match="no case of that name"):
         suite.stability_command("nothing", None, None)
-
-
-def named(name):
-    return next(c for c in all_cases() if c.name == name)
 
 
 def test_the_suite_notices_what_it_is_there_for(monkeypatch):

@@ -5,7 +5,7 @@ module          owns
 ==============  ===============================================================
 ``chain``       positions → file → store → nodes → frame, and its references
 ``projection``  pixels under far translations and wide and narrow views
-``extents``     clouds from nanometres to a light hour
+``extents``     clouds of any extent
 ``depth``       near and far, points on and behind the camera
 ``clouds``      degenerate clouds: coincident, collinear, one hot octant, …
 ``viewports``   pixel borders and the smallest and largest images

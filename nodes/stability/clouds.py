@@ -76,7 +76,9 @@ def drawn(name: str) -> float:
             entries = chain.leaf_entries
             stored = np.concatenate([chain.source[o : o + r] for o, r, _ in entries.tolist()])
             expect(np.array_equal(np.sort(stored), np.arange(len(positions))), "every point is in one leaf, once")
-            wrong += sum(chain.differing_pixels(camera) for camera in _cameras(positions))
+            cameras = _cameras(positions)
+            expect(is_drawn(chain.frame(cameras[0])).any(), "the picture shows something")
+            wrong += sum(map(chain.differing_pixels, cameras))
     return wrong
 
 
@@ -97,7 +99,9 @@ def cut(name: str) -> float:
     wrong = 0
     for order in _ORDERS:
         with built(positions, order=order) as chain:
-            for camera in _cameras(positions):
+            cameras = _cameras(positions)
+            expect(chain.chosen(cameras[0]).n_points, "a cell is visible")
+            for camera in cameras:
                 for threshold in (0.0, 1.0, 30.0):
                     wrong += _broken_leaves(chain, camera, threshold)
     return wrong

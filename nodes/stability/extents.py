@@ -1,4 +1,4 @@
-"""Clouds from a nanometre to a light hour, through the whole chain."""
+"""Clouds of any extent, from 1e-300 to 1e300, through the whole chain."""
 
 from __future__ import annotations
 

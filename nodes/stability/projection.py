@@ -93,10 +93,7 @@ def field_of_view(degrees: float) -> float:
     unit="points",
 )
 def culling(degrees: float) -> float:
-    """Points in the image (float64) whose leaf is culled, at this vertical field of view in degrees. Image position
-    of every drawn point of a city moved by this many metres on each axis (not exact in binary): built, stored,
-    projected in float32, against float64 of the points as given; 1920×1080.
-    """
+    """Points in the image (float64) whose cell is culled, at this vertical field of view in degrees."""
     lost = 0
     with built(city(), points_per_cell=50) as chain:
         owner = _owners(chain)

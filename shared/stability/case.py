@@ -6,6 +6,7 @@ digits) and returns the largest difference. Nothing is sampled by chance: seeds 
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -103,8 +104,12 @@ def run(case: Case) -> Outcome:
     start = time.perf_counter()
     value, reason = None, ""
     try:
-        value = float(case.measure())
-        verdict = PASSED if value <= case.bound else FAILED
+        found = float(case.measure())
+        verdict = PASSED if found <= case.bound else FAILED
+        if math.isfinite(found):
+            value = found
+        else:
+            verdict, reason = FAILED, f"found {found}, expected a finite number"
     except OutOfReach as limit:
         verdict, reason = OUT_OF_REACH, str(limit)
     except Exception as error:
