@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 from splatpipe.shared import metrics
+from splatpipe.shared.errors import DeviceError
 from splatpipe.shared.messages import FRAMEBUFFER_EMPTY
 
 EMPTY = int(FRAMEBUFFER_EMPTY)
@@ -125,6 +126,13 @@ def test_depth_rmse_is_of_the_pixels_that_both_cover():
     reference = frame(word(1.0), word(2.0), word(50.0), EMPTY)
     test = frame(word(4.0, 1), word(6.0, 2), EMPTY, word(8.0))
     assert metrics.depth_rmse(reference, test) == pytest.approx(math.sqrt((9 + 16) / 2))
+
+
+def test_a_missing_package_is_named_with_what_to_install(monkeypatch):
+    metrics.check_installed()
+    monkeypatch.setattr(metrics, "find_spec", lambda name: None if name == "flip_evaluator" else name)
+    with pytest.raises(DeviceError, match=r"FLIP: flip_evaluator is missing; install splatpipe\[error\]"):
+        metrics.check_installed()
 
 
 def test_pictures_of_two_sizes_are_refused():

@@ -57,8 +57,10 @@ def run_sweep(config: ErrorConfig, source: str, progress: FrameProgress) -> Swee
     """Measure every point on every scene; a point that this machine cannot draw becomes an omission.
 
     source : the file, for messages.
-    Raises InputError for a scene that is missing or damaged, before anything is measured.
+    Raises, before anything is measured: InputError for a scene that is missing or damaged, DeviceError where SSIM or
+    FLIP are not installed.
     """
+    metrics.check_installed()
     rows: list[dict[str, Any]] = []
     omissions: dict[Omission, None] = {}  # an ordered set
     for scene in [SweptScene(config, entry, source) for entry in config.scene]:
