@@ -90,8 +90,8 @@ def validate_command(
     )
     report.text(ASSUMPTIONS + (BEST if best else ""))
     add_comparisons(report, comparisons)
-    for scene, found in costs.items():
-        add_costs(report, found, Path(scene).stem)
+    report.heading("What it rests on")
+    add_costs(report, costs)
     console = Console(highlight=False, soft_wrap=True)
     median, worst = errors(comparisons)
     console.print(f"{len(comparisons)} settings: median error {median:.1%}, worst {worst:.1%}")

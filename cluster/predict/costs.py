@@ -25,6 +25,14 @@ from ...shared.config import RunConfig
 from ...shared.errors import InputError
 from .workload import Workload, threads_of
 
+CONTENTIONS = np.linspace(0, 1.5, 151)
+"""Slow-downs that are tried. At 1 a second thread gains nothing, above it costs."""
+
+OUTLIER = 0.1
+"""Share of a run's mean by which a frame may be off before it counts less."""
+
+REWEIGHTINGS = 8
+
 STAGES = ("culling", "sampling", "render")
 Columns = dict[str, np.ndarray]
 
@@ -118,27 +126,45 @@ def framebuffers_used(load: Workload, threads: int) -> np.ndarray:
 
 
 def fit_costs(runs: Sequence[Measured]) -> Costs:
-    """Costs from runs on one rank; contention from those with several threads. ``message_s`` is 0.
+    """Costs from runs on one rank, those with several threads included. ``message_s`` is 0.
 
     Raises InputError if no run is ``single`` with one thread.
     """
-    alone = [run for run in runs if run.topology == "single" and run.threads == 1]
+    single = [run for run in runs if run.topology == "single"]
+    alone = [run for run in single if run.threads == 1]
     if not alone:
         raise InputError("costs: found no run of topology single with one thread, expected at least one")
-    columns = [stage_columns(run.load, 1) for run in alone]
     stages = {
-        stage: fit_stage([of_run[stage] for of_run in columns], [run.stage_s(stage) for run in alone])
-        for stage in STAGES
+        stage: fit_stage(
+            [stage_columns(run.load, run.threads)[stage] for run in single], [run.stage_s(stage) for run in single]
+        )
+        for stage in ("culling", "sampling")
     }
+    stages["render"], contention = _fit_render(single)
     loop = [run.frame_s - sum(float(run.stage_s(stage).mean()) for stage in STAGES) for run in alone]
-    return Costs(stages, max(float(np.median(loop)), 0.0), 0.0, _contention(stages["render"], runs))
+    return Costs(stages, max(float(np.median(loop)), 0.0), 0.0, contention)
+
+
+def _fit_render(runs: Sequence[Measured]) -> tuple[StageCost, float]:
+    """Cost of the render stage, and the contention with which it fits all numbers of threads best."""
+    columns = [stage_columns(run.load, run.threads)["render"] for run in runs]
+    seconds = [run.stage_s("render") for run in runs]
+    tried = CONTENTIONS if any(run.threads > 1 for run in runs) else CONTENTIONS[:1]
+    fits = []
+    for contention in tried:
+        slower = [1 + contention * (run.threads - 1) for run in runs]
+        scaled = [{name: c * s for name, c in of.items()} for of, s in zip(columns, slower, strict=True)]
+        fits.append((fit_stage(scaled, seconds), float(contention)))
+    return min(fits, key=lambda fit: fit[0].residual)
 
 
 def fit_stage(columns: Sequence[Columns], seconds: Sequence[np.ndarray]) -> StageCost:
     """Non-negative least squares over the frames of all runs, each run weighted by the inverse of its mean.
 
-    Weights by run and not by frame keep the fitted mean at the measured mean. Columns are scaled to a norm of 1.
-    Source: Lawson, Hanson, "Solving Least Squares Problems", 1974, chapter 23.
+    Weights by run and not by frame keep the fitted mean at the measured mean. Columns are scaled to a norm of 1. Frames
+    further off than ``OUTLIER`` count less, in inverse proportion (Huber), since a machine that others disturb is slow
+    at times and never fast.
+    Source: Lawson, Hanson, "Solving Least Squares Problems", 1974, chapter 23; Holland, Welsch 1977 (reweighting).
     """
     from scipy.optimize import nnls
 
@@ -150,17 +176,10 @@ def fit_stage(columns: Sequence[Columns], seconds: Sequence[np.ndarray]) -> Stag
     b = np.concatenate([s * w for s, w in zip(seconds, weights, strict=True)])
     norm = np.linalg.norm(a, axis=0)
     norm[norm == 0] = 1.0
-    solution, _ = nnls(a / norm, b)
+    trust = np.ones(len(b))
+    for _ in range(REWEIGHTINGS):
+        solution, _ = nnls(a / norm * trust[:, None], b * trust)
+        off = np.abs(a / norm @ solution - b)
+        trust = np.sqrt(np.minimum(1.0, OUTLIER / np.maximum(off, OUTLIER)))
     residual = math.sqrt(float(np.mean((a / norm @ solution - b) ** 2)))
     return StageCost(dict(zip(names, (solution / norm).tolist(), strict=True)), residual)
-
-
-def _contention(render: StageCost, runs: Sequence[Measured]) -> float:
-    """Slow-down by each further busy thread: median over the runs on one rank with several."""
-    found = []
-    for run in runs:
-        used = float(framebuffers_used(run.load, run.threads).mean())
-        if run.topology == "single" and used > 1:
-            ideal = float(render.of(stage_columns(run.load, run.threads)["render"]).mean())
-            found.append((float(run.stage_s("render").mean()) / ideal - 1) / (used - 1))
-    return max(float(np.median(found)), 0.0) if found else 0.0

@@ -23,9 +23,8 @@ ASSUMPTIONS = (
 BEST = " Of each setting the fastest repeat counts: the machine was shared, and what others take only ever slows a run."
 
 
-def add_costs(report: Report, costs: Costs, name: str = "") -> None:
+def add_costs(report: Report, costs: Costs) -> None:
     """The fitted costs with their residuals."""
-    report.heading(f"Costs{': ' + name if name else ''}", 3)
     rows = [
         [stage, feature, 1e9 * seconds if seconds else None, cost.residual if i == 0 else None]
         for stage, cost in costs.stages.items()

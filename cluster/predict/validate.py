@@ -34,24 +34,18 @@ class Comparison:
 
 def compare(
     experiment: Experiment, measured: dict[int, Measured], n_points: int, machine: Machine
-) -> tuple[list[Comparison], dict[str, Costs]]:
-    """Every one of the first ``n_points`` points against the costs of its scene; the costs by scene.
+) -> tuple[list[Comparison], Costs]:
+    """Every one of the first ``n_points`` points against one set of costs for all scenes; those costs.
 
     The others are calibration: other settings than any of the compared points (``calibrate.extended``).
     """
-    costs: dict[str, Costs] = {}
+    costs = all_costs([run for i, run in measured.items() if i >= n_points], machine)
     out = []
-    for i in range(n_points):
-        if i not in measured:
-            continue
-        run = measured[i]
-        scene = run.config.scene.path
-        if scene not in costs:
-            others = [m for j, m in measured.items() if j >= n_points and m.config.scene.path == scene]
-            costs[scene] = all_costs(others, machine)
-        setting = Setting(run.topology, run.threads, run.config.pipeline.frames_in_flight)
-        rates = [record["frames_per_s"] for record in run.records]
-        out.append(Comparison(experiment.points[i], rates, forecast(costs[scene], run.load, setting, machine)))
+    for i, run in measured.items():
+        if i < n_points:
+            setting = Setting(run.topology, run.threads, run.config.pipeline.frames_in_flight)
+            rates = [record["frames_per_s"] for record in run.records]
+            out.append(Comparison(experiment.points[i], rates, forecast(costs, run.load, setting, machine)))
     return out, costs
 
 
