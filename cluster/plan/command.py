@@ -21,7 +21,7 @@ from .workload import Workload
 def plan_command(config_path: Path, overrides: list[str], *, measure: bool = False) -> dict[str, Any]:
     """The plan of a run, JSON-able.
 
-    measure : put parts back and time them, in this process and in whole runs; some ten seconds. Else nothing is drawn.
+    measure : put parts back and time them, in this process and in whole runs: about a minute. Else nothing is drawn.
     Raises InputError for a wrong configuration or scene.
     """
     job = Job(load_config(config_path, overrides))

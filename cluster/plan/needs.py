@@ -120,12 +120,11 @@ def _render_point_stride(job: Job, work: Workload) -> Part:
 
 
 def _splat_loop(job: Job, work: Workload) -> Part:
-    cost_ms = (COSTS.square_s - COSTS.point_s) * work.points * 1e3
+    cost_ms = COSTS.sized_s * work.points * 1e3
     if job.largest_point_px == 1:
         why = "points are one pixel: the kernel without sizes and inner loop is used"
-        return Part(SPLAT_LOOP, True, why, cost_ms, "ms/frame")
-    why = f"points are up to {job.largest_point_px} px wide"
-    return Part(SPLAT_LOOP, False, why, cost_ms, "ms/frame")
+        return Part(SPLAT_LOOP, True, why, cost_ms, "core-ms/frame")
+    return Part(SPLAT_LOOP, False, f"points are up to {job.largest_point_px} px wide", cost_ms, "core-ms/frame")
 
 
 def _colour(job: Job) -> Part:

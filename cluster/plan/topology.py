@@ -29,7 +29,8 @@ class UnitCosts:
     They stand only for what cannot be tried without loading the points: culling and sampling are timed where the run
     starts. Another machine's clock scales them together, which moves no decision.
 
-    point_s, square_s : drawing a point of one pixel, of 3×3.  pixel_s : clearing and merging a framebuffer word.
+    point_s, square_s : drawing a point of one pixel, of 3×3; sized_s : more for one pixel that might have been a square.
+    pixel_s : clearing and merging a framebuffer word.
     entry_s : of a render-points entry, before the threads start.
     gl_point_s : of a GPU, which takes no core; not measured.  picture_s, png_s, mp4_s : of a pixel.
     message_s, message_byte_s : a frame's messages and waits, each of their bytes.
@@ -40,6 +41,7 @@ class UnitCosts:
 
     point_s: float = 4e-9
     square_s: float = 13e-9
+    sized_s: float = 5e-9
     pixel_s: float = 1.5e-9
     entry_s: float = 0.2e-6
     gl_point_s: float = 0.5e-9
@@ -50,10 +52,10 @@ class UnitCosts:
     message_byte_s: float = 1e-9
     start_s: float = 2.0
     back_face_s: float = 5e-9
-    lod_s: float = 5e-9
-    flatness_s: float = 30e-9
-    checksum_s: float = 1e-9
-    opengl_s: float = 0.3
+    lod_s: float = 6e-9
+    flatness_s: float = 180e-9
+    checksum_s: float = 0.4e-9
+    opengl_s: float = 0.1
     colour_maps_s: float = 0.1
 
 
