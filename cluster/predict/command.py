@@ -49,8 +49,11 @@ def predict_command(
     for topology, threads in LAYOUTS:
         other = changed(case, str(config), [*overrides, f"pipeline.topology={topology}"], f"render.threads={threads}")
         forecasts.append((f"{topology}, {threads or 'all'} threads", other.predict()))
-    forecasts += [(change, changed(case, str(config), overrides, change).predict()) for change in what_if]
-    splits = scaling(costs, case.load, machine, ranks)
+    others = {change: changed(case, str(config), overrides, change) for change in what_if}
+    forecasts += [(change, other.predict()) for change, other in others.items()]
+    splits = {
+        name: scaling(of.costs, of.load, of.machine, ranks) for name, of in ({"as configured": case} | others).items()
+    }
 
     report = Report(f"What {config.stem} would do", f"splatpipe predict {config.name}")
     report.text(ASSUMPTIONS + (BEST if best else ""))
@@ -62,18 +65,22 @@ def predict_command(
     console = Console(highlight=False, soft_wrap=True)
     for name, found in forecasts:
         console.print(f"{name:28} {found.frames_per_s:9.1f} frames/s, {found.schedule.bottleneck} limits")
-    last = splits[-1]
-    console.print(
-        f"on paper, {last.ranks} ranks ({last.k} : {last.m} : {last.n}): {last.frames_per_s:.1f} frames/s, "
-        f"{last.limit[0]} limits by inequality {last.limit[1]}"
-    )
+    for name, found in splits.items():
+        last = found[max(found)]
+        console.print(
+            f"{name}, {max(found)} ranks on paper: {last.frames_per_s:.1f} frames/s on {last.k} : {last.m} : {last.n}, "
+            f"{last.limit[0]} limits by inequality {last.limit[1]}"
+        )
     for path in report.write(output / "report"):
         console.print(f"wrote {path}")
     if json_path is not None:
+        paper = [
+            {"case": name, "ranks": ranks} | _plain_split(split)
+            for name, found in splits.items()
+            for ranks, split in found.items()
+        ]
         rows = [_plain(name, found) for name, found in forecasts]
-        write_json(
-            json_path, {"forecasts": rows, "ranks": [_plain_split(split) for split in splits], "costs": asdict(costs)}
-        )
+        write_json(json_path, {"forecasts": rows, "ranks": paper, "costs": asdict(costs)})
 
 
 def validate_command(
@@ -123,5 +130,5 @@ def _plain(name: str, found: Forecast) -> dict[str, Any]:
 
 def _plain_split(split: Split) -> dict[str, Any]:
     stage, inequality = split.limit
-    figures = {"ranks": split.ranks, "k": split.k, "m": split.m, "n": split.n, "frames_per_s": split.frames_per_s}
+    figures = {"used": split.ranks, "k": split.k, "m": split.m, "n": split.n, "frames_per_s": split.frames_per_s}
     return figures | {"limiting_stage": stage, "inequality": inequality, "parts_s": split.parts_s}

@@ -10,7 +10,6 @@ Source: thesis 5.3.1 and Figure 5-3; Ma, Painter, Hansen, Krogh 1994 (binary swa
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 from .costs import STAGES, Costs, stage_columns
@@ -110,12 +109,13 @@ def best_split(costs: Costs, load: Workload, machine: Machine, ranks: int) -> Sp
     return max(options, key=lambda split: (split.frames_per_s, -split.ranks))
 
 
-def scaling(costs: Costs, load: Workload, machine: Machine, largest: int) -> Sequence[Split]:
-    """The best split of at most 4, 8, … ``largest`` ranks."""
-    splits: list[Split] = []
+def scaling(costs: Costs, load: Workload, machine: Machine, largest: int) -> dict[int, Split]:
+    """Ranks there are, 4, 8, … ``largest`` → the best split of at most so many."""
+    splits: dict[int, Split] = {}
+    best: list[Split] = []
     for ranks in [*(n for n in (2**i for i in range(2, 20)) if n < largest), max(largest, 3)]:
-        found = best_split(costs, load, machine, ranks)
-        splits.append(max([*splits[-1:], found], key=lambda split: split.frames_per_s))
+        best = [max([*best, best_split(costs, load, machine, ranks)], key=lambda split: split.frames_per_s)]
+        splits[ranks] = best[0]
     return splits
 
 
