@@ -29,7 +29,7 @@ class UnitCosts:
     They stand only for what cannot be tried without loading the points: culling and sampling are timed where the run
     starts. Another machine's clock scales them together, which moves no decision.
 
-    point_s, square_s : drawing a point of one pixel, of 3×3; sized_s : more for one pixel that might have been a square.
+    point_s, square_s : drawing a point of one pixel, of 3×3; sized_s : more for one pixel found by size.
     pixel_s : clearing and merging a framebuffer word.
     entry_s : of a render-points entry, before the threads start.
     gl_point_s : of a GPU, which takes no core; not measured.  picture_s, png_s, mp4_s : of a pixel.
