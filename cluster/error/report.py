@@ -51,8 +51,8 @@ COLUMNS = {
     "value": "value",
     "order": "order",
     "frame_ms": "frame ms",
-    "frame_min_ms": "min",
-    "frame_max_ms": "max",
+    "frame_q1_ms": "1st quartile",
+    "frame_q3_ms": "3rd",
     "culling_ms": "cull ms",
     "sampling_ms": "sample ms",
     "render_ms": "render ms",
@@ -72,14 +72,15 @@ COLUMNS = {
 _LEGEND = (
     "Reference: every input point in float64, no level of detail, no rounding, at the same cameras and point size; "
     "positions are the stored ones, within 2⁻²⁵ of a block's edge of the source's. "
-    "Frame time: culling, sampling and drawing by one rank, warm, mean over the cameras; median, least and greatest "
-    "of the repeats. Encoding is timed apart, errors are computed in a pass of their own. "
+    "Frame time: culling, sampling and drawing by one rank, warm, mean over the cameras; median and quartiles of "
+    "the repeats. Encoding is timed apart, errors are computed in a pass of their own. "
     "Bytes a frame: camera (twice), visibility bits and render-points as sent, and the encoded picture. "
     "Errors are means over the cameras. FLIP (0…1, 67 pixels a degree), SSIM (Gaussian window, σ = 1.5 px) and "
     "PSNR (range 255, 100 dB where equal) are of the whole picture; foreground PSNR, holes and false pixels (shares) "
     "of the pixels that the reference covers; depth RMSE of the pixels that both cover, as a share of the scene's "
     "radius. "
-    "Ringed in the diagrams: the Pareto front, the points that no other beats in both; a dotted line is zero error."
+    "Ringed in the diagrams: the Pareto front, the points that no other beats in both; a dotted line is zero error, "
+    "grey bars are quartiles."
 )
 
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000", "#7f7f7f")  # Okabe and Ito
@@ -180,6 +181,9 @@ def _diagram(panel: Any, rows: list[Row], methods: list[str], cost: Axis, error:
     if len(positive) < len(rows):
         panel.axhline(exact, color="#999999", linewidth=0.8, linestyle=":")
         panel.annotate("0", (1.005, exact), xycoords=("axes fraction", "data"), va="center", fontsize=9)
+    if cost.column == "frame_ms":
+        quartiles = [[row[key] for row in rows] for key in ("frame_q1_ms", "frame_q3_ms")]
+        panel.hlines(y, *quartiles, color="#999999", linewidth=1.0)
     front = pareto_front(x.tolist(), y.tolist())
     ring = {"markersize": 12, "markerfacecolor": "none", "markeredgecolor": "black", "markeredgewidth": 0.8}
     panel.plot(x[front], y[front], "o", label=_FRONT, **ring)
