@@ -24,7 +24,7 @@ Topology = Literal["single", "pipelined"]
 
 @dataclass(frozen=True)
 class UnitCosts:
-    """Seconds of one core for a unit of work, from runs on 2 cores of an AMD EPYC without a GPU.
+    """Seconds of one core for a unit of work, from runs on 2 cores of an Intel Xeon without a GPU.
 
     They stand only for what cannot be tried without loading the points: culling and sampling are timed where the run
     starts. Another machine's clock scales them together, which moves no decision.
