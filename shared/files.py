@@ -11,7 +11,6 @@ from typing import Any
 
 from .errors import InputError, SplatpipeError
 
-
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Error numbers of a disk, quota or file-size limit that is used up."""
 
