@@ -105,6 +105,7 @@ def add_comparisons(report: Report, comparisons: Sequence[Comparison]) -> None:
 
 def _scatter(comparisons: Sequence[Comparison]) -> Any:
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
     figure = Figure(figsize=(5, 5))
     axes = figure.add_subplot()
@@ -115,6 +116,10 @@ def _scatter(comparisons: Sequence[Comparison]) -> Any:
     ends = np.array([x.min() / 1.5, x.max() * 1.5])
     axes.plot(ends, ends, color="grey")
     axes.fill_between(ends, ends * (1 - WORST_GOAL), ends * (1 + WORST_GOAL), color="grey", alpha=0.15)
+    for axis in (axes.xaxis, axes.yaxis):  # plain numbers, few enough not to touch
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.set_major_formatter(ScalarFormatter())
+        axis.set_minor_formatter(NullFormatter())
     axes.set_xlabel("measured, frames/s")
     axes.set_ylabel("predicted, frames/s")
     axes.legend()
