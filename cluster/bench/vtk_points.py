@@ -22,8 +22,8 @@ class VtkPoints:
     name = "vtk"
 
     def __init__(self, positions: np.ndarray, colour: np.ndarray, width: int, height: int) -> None:
-        import vtk
-        from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
+        import vtk  # pyright: ignore[reportMissingImports]
+        from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray  # pyright: ignore[reportMissingImports]
 
         self._vtk = vtk
         n = len(positions)
@@ -65,7 +65,7 @@ class VtkPoints:
 
     def draw(self, camera: Camera, world_from_camera: np.ndarray, fov_y_rad: float) -> np.ndarray:
         """(height, width, 3) uint8, row 0 on top."""
-        from vtkmodules.util.numpy_support import vtk_to_numpy
+        from vtkmodules.util.numpy_support import vtk_to_numpy  # pyright: ignore[reportMissingImports]
 
         eye, back, up = (world_from_camera[:3, i] for i in (3, 2, 1))
         view = self._renderer.GetActiveCamera()

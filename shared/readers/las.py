@@ -103,7 +103,7 @@ class LasSource(Source):
 
     def _byte(self, name: str) -> int:
         """Where a field stands in a record."""
-        fields = self._dtype.fields or {}
+        fields: Any = self._dtype.fields
         return fields[name][1]
 
 
