@@ -344,4 +344,6 @@ def test_drawing_nothing_compiles_all_that_drawing_needs():
     before = [list(kernel.signatures) for kernel in (kernels.draw, kernels.merge, pieces._split)]
     draw(cloud(5000), camera(61, 53), render_points((0, 5000, 1), (1, 4000, 7)), PointSize(3), threads=2)
     assert [kernel.signatures for kernel in (kernels.draw, kernels.merge, pieces._split)] == before
-    assert [len(signatures) for signatures in before] == [1, 1, 1]
+    # a constant colour is a column of stride 0, which other tests draw: a variant of its own
+    contiguous = [[s for s in signatures if all(getattr(a, "layout", "C") == "C" for a in s)] for signatures in before]
+    assert [len(signatures) for signatures in contiguous] == [1, 1, 1]
