@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -257,12 +258,19 @@ def child(out, capacity, limit=0):
 def test_killed_build_leaves_nothing_that_looks_whole(tmp_path, capacity):
     rng = random.Random(capacity)
     out = tmp_path / "s"
+    process = child(out, capacity)
+    assert process.stdout is not None
+    process.stdout.readline()
+    started = time.perf_counter()
+    process.communicate()
+    whole_s = time.perf_counter() - started
     killed = 0
-    for _ in range(5):
+    for share in (0.0, *(rng.uniform(0, 1) for _ in range(5))):  # the first is killed before it can be done
+        shutil.rmtree(out, ignore_errors=True)
         process = child(out, capacity)
         assert process.stdout is not None
         process.stdout.readline()
-        time.sleep(rng.uniform(0, 0.6))
+        time.sleep(share * whole_s)
         process.send_signal(signal.SIGKILL)
         process.communicate()
         if out.exists():
