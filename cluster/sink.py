@@ -39,7 +39,6 @@ class FrameSink:
             self.times["png_s"] = []
         if self._film is not None:
             self.times["mp4_s"] = self._film.times
-        self.bytes_written = 0
 
     def put(self, frame: int, rgba: np.ndarray) -> None:
         """Queue a frame. Raises what an encoder of an earlier frame ran into."""
@@ -74,7 +73,6 @@ class FrameSink:
             opaque = bool((rgba[..., 3] == 255).all())
             image = Image.fromarray(rgba[..., :3] if opaque else rgba)
             write_whole(path, lambda part: image.save(part, format="PNG", compress_level=PNG_LEVEL))
-            self.bytes_written += path.stat().st_size
             self.times["png_s"].append(time.perf_counter() - started)
         finally:
             self._room.release()

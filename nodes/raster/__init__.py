@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from ...shared.camera import Camera
-from ...shared.errors import InputError
+from ...shared.errors import InputError, MessageError
 
 MAX_SIDE_PX = 1 << 15
 """Largest side of a point's square, and of the viewport of ``cpu``: pixel indices stay within int32."""
@@ -97,3 +97,9 @@ def pixel_from_blocks(camera: Camera, block_origin: np.ndarray) -> np.ndarray:
     out[:, :, :3] = m[:, :3]
     out[:, :, 3] = (block_origin - camera.eye) @ m[:, :3].T
     return out.astype(np.float32)
+
+
+def check_viewport(camera: Camera, width: int, height: int) -> None:
+    """Raise MessageError for a camera of another viewport than the rasterizer was made for."""
+    if (camera.width, camera.height) != (width, height):
+        raise MessageError(f"camera viewport: found {camera.width}×{camera.height}, expected {width}×{height}")

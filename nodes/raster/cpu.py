@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from ...shared.camera import Camera
-from ...shared.errors import InputError, MessageError
+from ...shared.errors import InputError
 from ...shared.messages import FRAMEBUFFER_EMPTY
-from . import MAX_SIDE_PX, PointSize, ResidentPoints, pixel_from_blocks
+from . import MAX_SIDE_PX, PointSize, ResidentPoints, check_viewport, pixel_from_blocks
 from .pieces import split_entries
 
 PIECE_POINTS = 1 << 14
@@ -79,8 +79,7 @@ class CpuRasterizer:
         from . import kernels
 
         height, width = self._frame.shape
-        if (camera.width, camera.height) != (width, height):
-            raise MessageError(f"camera viewport: found {camera.width}×{camera.height}, expected {width}×{height}")
+        check_viewport(camera, width, height)
         pieces = split_entries(entries, self._block_first_point, len(self._x), PIECE_POINTS)
         used = np.flatnonzero(np.bincount(pieces["segment"], minlength=len(self._rows)))
         self._rows[used] = pixel_from_blocks(camera, self._block_origin[used])

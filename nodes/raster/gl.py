@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 
 from ...shared.camera import Camera
-from ...shared.errors import DeviceError, InputError, MessageError
-from . import PointSize, ResidentPoints, pixel_from_blocks
+from ...shared.errors import DeviceError, InputError
+from . import PointSize, ResidentPoints, check_viewport, pixel_from_blocks
 from .gl_context import check_errors, open_context, shader_source, storage_limit
 from .pieces import split_entries
 
@@ -99,8 +99,7 @@ class _GlRasterizer(ABC):
         DeviceError for an OpenGL error.
         """
         height, width = self._shape
-        if (camera.width, camera.height) != (width, height):
-            raise MessageError(f"camera viewport: found {camera.width}×{camera.height}, expected {width}×{height}")
+        check_viewport(camera, width, height)
         blocks, batches = self._batches(entries)
         with self._context:  # another rasterizer of this thread may have made its own current
             self._rows.write(pixel_from_blocks(camera, self._block_origin[blocks]))
