@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from ..nodes.culling import CullingNode
-from ..nodes.raster import PointSize
+from ..nodes.raster import PointSize, SplatSettings
 from ..nodes.raster.choose import make_rasterizer
 from ..nodes.raster.cpu import kernels_cached
-from ..nodes.render import RenderNode, load_points
+from ..nodes.render import RenderNode, Wanted, load_points
 from ..nodes.sampling import SamplingNode
 from ..shared.camera import Camera
 from ..shared.camera_path import camera_path
@@ -41,8 +41,19 @@ class Job:
         self.backface = config.culling.backface and "normal" in info.attributes
         self.pixel_threshold = config.sampling.pixel_threshold
         render = config.render
-        self.point_size = PointSize(render.point_size_px, render.point_size_world, render.point_size_max_px)
-        self.largest_point_px = render.point_size_max_px if render.point_size_world else render.point_size_px
+        self.point_size = PointSize(
+            render.point_size_px, render.point_size_world, render.point_size_max_px, render.point_size_adaptive
+        )
+        self.largest_point_px = (
+            render.point_size_max_px if render.point_size_world or render.point_size_adaptive else render.point_size_px
+        )
+        self.splats = SplatSettings(**dict(config.splats)) if render.style == "splats" else None
+        self.compact = render.positions == "compact"
+        self.wanted = Wanted(
+            splats=self.splats is not None,
+            features=self.splats is not None and self.splats.features,
+            cells=self.compact or render.point_size_adaptive,
+        )
         self.background = parse_colour(render.background, "render.background")
         self.colouring = Colouring.choose(self.scene, render.colour, render.colormap, render.colour_range)
         self._path = camera_path(config.camera, info, self.n_frames)
@@ -64,13 +75,20 @@ class Job:
     def open_render(self, progress: Callable[[str, int], None]) -> Iterator[RenderStage]:
         """The render node of this run with its points loaded, its kernels compiled and its output open."""
         progress("loading points", 0)
-        points = load_points(self.scene, self.colouring, verify=self.config.scene.verify)
+        points = load_points(self.scene, self.colouring, self.wanted, verify=self.config.scene.verify)
         render, output = self.config.render, self.config.output
         camera = self.config.camera
         with ExitStack() as stack:
             rasterizer = stack.enter_context(
                 make_rasterizer(
-                    render.rasterizer, points, camera.width, camera.height, self.point_size, render.threads or None
+                    render.rasterizer,
+                    points,
+                    camera.width,
+                    camera.height,
+                    self.point_size,
+                    render.threads or None,
+                    splats=self.splats,
+                    compact=self.compact,
                 )
             )
             node = RenderNode(rasterizer)

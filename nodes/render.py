@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from ..shared.camera import Camera
@@ -37,13 +39,32 @@ class RenderNode:
         return self._rasterizer.draw(camera, chosen.entries)
 
 
-def load_points(scene: Scene, colouring: Colouring, *, verify: bool) -> ResidentPoints:
+@dataclass(frozen=True)
+class Wanted:
+    """What a run needs of the points besides position and colour; nothing else is loaded.
+
+    splats : normals and radii.  features : classes and quads of the cells.
+    cells : blocks as single cells, with the spacing of their points.
+    """
+
+    splats: bool = False
+    features: bool = False
+    cells: bool = False
+
+
+def load_points(scene: Scene, colouring: Colouring, wanted: Wanted = Wanted(), *, verify: bool) -> ResidentPoints:
     """The render rank's half of a scene, coloured. Positions (and rgb) are mapped from the files, not copied.
 
     verify : hold the checksums of the arrays it reads against the scene first: one read of each.
-    Raises StoreError naming the array that is damaged.
+    Raises StoreError naming the array that is damaged or that the scene was built without.
     """
     if verify:
         scene.check(["x", "y", "z", *([f"attr_{colouring.attribute}"] if colouring.attribute else [])])
     block_first_point, block_origin = scene.blocks()
-    return ResidentPoints(*scene.positions(), colour_words(scene, colouring), block_first_point, block_origin)
+    return ResidentPoints(
+        *scene.positions(),
+        colour_words(scene, colouring),
+        block_first_point,
+        block_origin,
+        root_edge=scene.info.edge,
+    )

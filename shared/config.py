@@ -46,9 +46,20 @@ class SceneSection(Section):
     verify: bool = True
 
 
+class Box(Section):
+    """One clip box: an axis-aligned box in world coordinates, and which side of it is kept."""
+
+    lower: Vector
+    upper: Vector
+    keep: Literal["inside", "outside"] = "inside"
+
+
 class CameraSection(Section):
     """``[camera]``."""
 
+    view: Literal["mono", "stereo", "panorama"] = "mono"
+    stereo_base: Annotated[float, Field(ge=0)] = 0.0
+    stereo_layout: Literal["side-by-side", "over-under"] = "side-by-side"
     path: Literal["orbit", "keyframes", "poses"] = "orbit"
     width: Annotated[int, Field(ge=1, le=16384)] = 1280
     height: Annotated[int, Field(ge=1, le=16384)] = 720
@@ -62,6 +73,13 @@ class CameraSection(Section):
     sweep_deg: float = 360.0
     keyframes: list[Keyframe] = []
     poses: list[Matrix] = []
+
+
+class FilterSection(Section):
+    """``[filter]``."""
+
+    classes: list[Annotated[int, Field(ge=0, le=255)]] = []
+    boxes: list[Box] = []
 
 
 class CullingSection(Section):
@@ -80,14 +98,30 @@ class RenderSection(Section):
     """``[render]``."""
 
     rasterizer: Literal["auto", "cpu", "gl", "gl-points"] = "auto"
+    style: Literal["points", "splats"] = "points"
+    positions: Literal["float32", "compact"] = "float32"
     threads: Annotated[int, Field(ge=0, le=1024)] = 0
     point_size_px: Annotated[int, Field(ge=1, le=255)] = 1
     point_size_world: Annotated[float, Field(ge=0)] = 0.0
     point_size_max_px: Annotated[int, Field(ge=1, le=255)] = 64
+    point_size_adaptive: bool = False
     colour: str = "auto"
     colormap: str = "viridis"
     colour_range: tuple[float, float] | None = None
+    class_colours: dict[str, str] = {}
     background: str = "#1e2127"
+    supersampling: Annotated[int, Field(ge=1, le=8)] = 1
+    edl_strength: Annotated[float, Field(ge=0)] = 0.0
+    edl_radius_px: Annotated[float, Field(ge=0.5, le=64)] = 1.5
+
+
+class SplatSection(Section):
+    """``[splats]``: used where ``render.style`` is ``splats``."""
+
+    radius_scale: Positive = 1.0
+    depth_offset: Annotated[float, Field(ge=0)] = 1.0
+    features: bool = False
+    lighting: bool = True
 
 
 class PipelineSection(Section):
@@ -105,7 +139,10 @@ class OutputSection(Section):
     frames: PositiveInt = 120
     fps: Annotated[float, Field(gt=0, le=1000)] = 30.0
     png: bool = True
+    png_bits: Literal[8, 16] = 8
     mp4: bool = False
+    depth: bool = False
+    normals: bool = False
 
 
 class RunConfig(Section):
@@ -113,9 +150,11 @@ class RunConfig(Section):
 
     scene: SceneSection = SceneSection()
     camera: CameraSection = CameraSection()
+    filter: FilterSection = FilterSection()
     culling: CullingSection = CullingSection()
     sampling: SamplingSection = SamplingSection()
     render: RenderSection = RenderSection()
+    splats: SplatSection = SplatSection()
     pipeline: PipelineSection = PipelineSection()
     output: OutputSection = OutputSection()
 

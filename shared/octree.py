@@ -16,6 +16,11 @@ MAX_LEVEL = 21
 """Deepest level: 21 bits an axis fill a 63-bit Morton code."""
 
 
+FEATURES = ("none", "flat", "edge", "corner")
+"""Names of the codes of ``Octree.feature``; ``none``: points that fill space, or too few to tell."""
+FLAT, EDGE, CORNER = 1, 2, 3
+
+
 @dataclass(frozen=True)
 class Octree:
     """Flat arrays over cells, breadth-first; the root is cell 0.
@@ -29,6 +34,9 @@ class Octree:
     n_below : (n,) int64, input points inside the cell's cube.
     cone : (n, 4) float32 or None: unit axis and cosine of the half angle of a cone that holds every normal below the
         cell; a cosine of −1 means "any direction".
+    feature : (n,) uint8 or None: what the points below the cell look like, one of ``FEATURES`` (thesis 4.3.1).
+    quad : (n, 3, 3) float32 or None, of flat cells: centre relative to the cell's centre, and the two half axes of the
+        rectangle that covers the cell's points; world units.
     point_order : ``layered`` (an inner cell owns its own level-of-detail set, in random order, so any prefix is a
         fair sample) or ``depth-first`` (points in leaves only, an inner cell's range spans its leaves).
     """
@@ -45,6 +53,8 @@ class Octree:
     n_below: np.ndarray
     cone: np.ndarray | None
     point_order: str
+    feature: np.ndarray | None = None
+    quad: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.level)

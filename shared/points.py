@@ -12,6 +12,7 @@ intensity       float32  as in the file
 classification  uint8    ASPRS class code
 return_number   uint8    1 = first return
 gps_time        float64  seconds, as in the file
+radius          uint8    splat radius, a logarithm of its share of the root cube's edge (``pack_radii``)
 ==============  =======  ===================================================================
 """
 
@@ -31,6 +32,7 @@ ATTRIBUTES: Mapping[str, np.dtype] = {
     "classification": np.dtype("u1"),
     "return_number": np.dtype("u1"),
     "gps_time": np.dtype("<f8"),
+    "radius": np.dtype("u1"),
 }
 
 NO_NORMAL = np.uint32(0x8000_8000)
@@ -125,3 +127,23 @@ def unpack_normals(words: np.ndarray) -> np.ndarray:
     n /= np.linalg.norm(n, axis=1, keepdims=True)
     n[words == NO_NORMAL] = 0.0
     return n.astype(np.float32)
+
+
+RADIUS_STEPS = 8
+"""Codes an octave of splat radii: neighbouring radii differ by 9 %."""
+
+
+def pack_radii(radii: np.ndarray, root_edge: float) -> np.ndarray:
+    """(n,) uint8 codes of (n,) radii in world units: radius = root_edge · 2**(−code / RADIUS_STEPS).
+
+    Rounded up, so that a splat never shrinks: at most 9 % too large. Radii below root_edge · 2**−31.875, zero and NaN
+    get code 255, those above root_edge code 0.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        code = np.floor(-np.log2(np.asarray(radii, np.float64) / root_edge) * RADIUS_STEPS + 1e-9)
+    return np.clip(np.nan_to_num(code, nan=255.0, posinf=255.0, neginf=0.0), 0, 255).astype(np.uint8)
+
+
+def radius_table(root_edge: float) -> np.ndarray:
+    """(256,) float64: radius in world units of each code of ``pack_radii``."""
+    return root_edge * np.exp2(-np.arange(256) / RADIUS_STEPS)

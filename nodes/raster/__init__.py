@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, Self
 
 import numpy as np
 
@@ -20,6 +20,22 @@ MAX_SIDE_PX = 1 << 15
 
 
 @dataclass(frozen=True)
+class CellFeatures:
+    """What the points of a cell look like (thesis 4.3.1), of every cell that owns points, in stored order.
+
+    first_point, n_points : (c,) int64, the cell's own range in the point-array; ascending, without overlap.
+    feature : (c,) uint8, code of ``octree.FEATURES``.
+    quad_center : (c, 3) float64, world frame.  quad_axes : (c, 2, 3) float32, half axes, world units; of flat cells.
+    """
+
+    first_point: np.ndarray
+    n_points: np.ndarray
+    feature: np.ndarray
+    quad_center: np.ndarray
+    quad_axes: np.ndarray
+
+
+@dataclass(frozen=True)
 class ResidentPoints:
     """The render rank's half of a scene: points relative to the origin of their block, no octree.
 
@@ -28,6 +44,14 @@ class ResidentPoints:
     block_first_point : (b,) int64, ascending, the first is 0: block i holds points
         block_first_point[i] … block_first_point[i + 1] − 1 (the last one: to the end).
     block_origin : (b, 3) float64, world frame.
+
+    What only some settings need is None elsewhere:
+    normal : (n,) uint32 octahedral words (``points.pack_normals``): splats.
+    radius : (n,) uint8 codes (``points.pack_radii`` with ``root_edge``): splats.
+    root_edge : edge of the scene's root cube, world units.
+    block_spacing : (b,) float32, distance between neighbouring points of each block, world units: adaptive point size.
+        Blocks are single cells then.
+    features : what cells look like: feature-driven splats.
     """
 
     x: np.ndarray
@@ -36,6 +60,11 @@ class ResidentPoints:
     colour: np.ndarray
     block_first_point: np.ndarray
     block_origin: np.ndarray
+    normal: np.ndarray | None = None
+    radius: np.ndarray | None = None
+    root_edge: float = 1.0
+    block_spacing: np.ndarray | None = None
+    features: CellFeatures | None = None
 
     def __len__(self) -> int:
         return len(self.x)
@@ -48,7 +77,9 @@ class PointSize:
     pixels : fixed side ≥ 1; used alone when ``world`` is 0.
     world : side in world units, > 0 for attenuation with distance: side = clamp(world · focal_px / depth, pixels,
         maximum), rounded to the nearest integer.
-    maximum : largest side in pixels when attenuated; ``pixels`` if that is larger.
+    maximum : largest side in pixels when attenuated or adaptive; ``pixels`` if that is larger.
+    adaptive : side grows with the spacing of the points of a cell: side = clamp(max(world, block_spacing) · focal_px /
+        depth, pixels, maximum), rounded. Needs ``ResidentPoints.block_spacing``.
 
     A point at (u, v) covers the columns floor(u − (side − 1) / 2) … + side − 1, and rows likewise: the pixels whose
     centres lie within half a side of it. The part inside the image is drawn, at the depth of the point.
@@ -58,6 +89,7 @@ class PointSize:
     pixels: int = 1
     world: float = 0.0
     maximum: int = 64
+    adaptive: bool = False
 
     def __post_init__(self) -> None:
         if not (1 <= self.pixels <= MAX_SIDE_PX and 1 <= self.maximum <= MAX_SIDE_PX):
@@ -66,6 +98,30 @@ class PointSize:
             )
         if not 0 <= self.world < math.inf:
             raise InputError(f"point size: found {self.world} world units, expected a finite number ≥ 0")
+
+
+@dataclass(frozen=True)
+class SplatSettings:
+    """How splats are drawn (thesis 4.4.3).
+
+    radius_scale : factor on the stored radii, > 0.
+    depth_offset : ε of the visibility pass, in splat radii, ≥ 0: fragments up to this much behind the nearest surface
+        are blended with it.
+    features : feature-driven: one quad for a flat cell in the visibility pass (thesis 4.4.3).
+    lighting : Appendix C: ambient, diffuse and specular light where there are normals.
+    Raises InputError for a value out of range or not finite.
+    """
+
+    radius_scale: float = 1.0
+    depth_offset: float = 1.0
+    features: bool = False
+    lighting: bool = True
+
+    def __post_init__(self) -> None:
+        if not 0 < self.radius_scale < math.inf:
+            raise InputError(f"splats: found radius_scale {self.radius_scale}, expected a finite number > 0")
+        if not 0 <= self.depth_offset < math.inf:
+            raise InputError(f"splats: found depth_offset {self.depth_offset}, expected a finite number ≥ 0")
 
 
 class Rasterizer(Protocol):
@@ -84,6 +140,10 @@ class Rasterizer(Protocol):
     def close(self) -> None:
         """Release threads and device memory."""
         ...
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(self, *_: object) -> None: ...
 
 
 def pixel_from_blocks(camera: Camera, block_origin: np.ndarray) -> np.ndarray:

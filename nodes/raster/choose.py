@@ -2,42 +2,56 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from ...shared.errors import ConfigError
-from . import PointSize, ResidentPoints
-
-if TYPE_CHECKING:
-    from .cpu import CpuRasterizer
-    from .gl import GlComputeRasterizer, GlPointsRasterizer
+from . import PointSize, Rasterizer, ResidentPoints, SplatSettings
 
 RASTERIZERS = ("auto", "cpu", "gl", "gl-points")
 
 
 def make_rasterizer(
-    name: str, points: ResidentPoints, width: int, height: int, size: PointSize, threads: int | None
-) -> CpuRasterizer | GlComputeRasterizer | GlPointsRasterizer:
+    name: str,
+    points: ResidentPoints,
+    width: int,
+    height: int,
+    size: PointSize,
+    threads: int | None,
+    *,
+    splats: SplatSettings | None = None,
+    compact: bool = False,
+) -> Rasterizer:
     """A rasterizer over ``points``; the caller closes it (it is a context manager).
 
     name : one of ``RASTERIZERS``. ``auto`` takes ``gl`` where a GPU draws it and ``cpu`` elsewhere: OpenGL in software
         is slower than the compiled kernels.
     threads : of ``cpu``; None for one a core.
-    Raises ConfigError for another name, DeviceError if OpenGL is asked for and missing.
+    splats : draw splats instead of points; ``size`` is not used then. Points need normals and radii.
+    compact : of ``cpu`` points: hold positions in fixed point inside their block. Blocks should be single cells.
+    Raises ConfigError for another name or a style that it does not draw, DeviceError if OpenGL is asked for and not
+    there.
     """
-    name = resolve_rasterizer(name)
-    match name:
-        case "cpu":
+    match resolve_rasterizer(name), splats:
+        case "cpu", None:
             from .cpu import CpuRasterizer
 
-            return CpuRasterizer(points, width, height, size, threads)
-        case "gl":
+            return CpuRasterizer(points, width, height, size, threads, compact=compact)
+        case "cpu", SplatSettings():
+            from .splat import CpuSplatRasterizer
+
+            return CpuSplatRasterizer(points, width, height, splats, threads)
+        case "gl", None:
             from .gl import GlComputeRasterizer
 
             return GlComputeRasterizer(points, width, height, size)
-        case "gl-points":
+        case "gl", SplatSettings():
+            from .gl_splat import GlSplatRasterizer
+
+            return GlSplatRasterizer(points, width, height, splats)
+        case "gl-points", None:
             from .gl import GlPointsRasterizer
 
             return GlPointsRasterizer(points, width, height, size)
+        case "gl-points", _:
+            raise ConfigError("render.rasterizer = 'gl-points' draws no splats, expected auto, cpu or gl")
     raise ConfigError(f"render.rasterizer = {name!r}, expected one of {', '.join(RASTERIZERS)}")
 
 

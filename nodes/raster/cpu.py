@@ -51,6 +51,8 @@ class CpuRasterizer:
         height: int,
         size: PointSize = PointSize(),  # noqa: B008 (frozen)
         threads: int | None = None,
+        *,
+        compact: bool = False,
     ) -> None:
         if not (1 <= width <= MAX_SIDE_PX and 1 <= height <= MAX_SIDE_PX):
             raise InputError(f"viewport: found {width}×{height}, expected 1…{MAX_SIDE_PX} px a side")
