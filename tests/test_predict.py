@@ -18,7 +18,7 @@ from splatpipe.cluster.predict.forecast import Machine, Setting, fit_messages, f
 from splatpipe.cluster.predict.hybrid import best_split, scaling, split_costs
 from splatpipe.cluster.predict.recurrence import Stage, run_schedule
 from splatpipe.cluster.predict.whatif import Case, changed
-from splatpipe.cluster.predict.workload import Workload, count_workload, threads_of
+from splatpipe.cluster.predict.workload import COLD_POINTS, Workload, count_workload, threads_of
 from splatpipe.shared.build import BuildSettings, build_scene
 from splatpipe.shared.config import RunConfig, load_config, parse_config
 from splatpipe.shared.errors import ConfigError, InputError
@@ -136,12 +136,21 @@ TRUE = Costs(
         "culling": StageCost({"frame": 2e-5, "cell": 3e-9, "visible cell": 1e-9}, 0.0),
         "sampling": StageCost({"frame": 1e-5, "cell": 1e-9, "visible cell": 2e-9, "entry": 1e-8}, 0.0),
         "render": StageCost(
-            {"frame": 1e-4, "entry": 5e-8, "point": 6e-9, "covered pixel": 1e-9, "merged pixel": 1e-9}, 0.0
+            {
+                "frame": 1e-4,
+                "entry": 5e-8,
+                "point": 6e-9,
+                "cold point": 2e-9,
+                "covered pixel": 1e-9,
+                "merged pixel": 1e-9,
+            },
+            0.0,
         ),
     },
     loop_s=1e-4,
     message_s=3e-5,
     contention=0.1,
+    late_s=1e-3,
 )
 
 
@@ -149,7 +158,8 @@ def load_of(seed=0, points=1e6, pixels=1280 * 720, n_frames=30, square=4):
     rng = np.random.default_rng(seed)
     counts = points * rng.uniform(0.5, 1.5, n_frames)
     visible, entries = counts / rng.uniform(50, 150, n_frames), counts / rng.uniform(500, 900, n_frames)
-    return Workload(30_000 * points / 1e6, pixels, visible, entries, counts, counts * square, 4000, entries * 9)
+    cold, covered = entries * rng.uniform(100, 200, n_frames), counts * square
+    return Workload(30_000 * points / 1e6, pixels, visible, entries, counts, cold, covered, 4000, entries * 9)
 
 
 def run_of(load, topology, threads, machine=Machine(cores=8), noise=0.0):  # noqa: B008
@@ -172,17 +182,18 @@ def run_of(load, topology, threads, machine=Machine(cores=8), noise=0.0):  # noq
 def test_the_fit_finds_the_costs_that_made_the_runs_and_predicts_others():
     loads = [load_of(1, 2e5), load_of(2, 2e6), load_of(3, 1e6, pixels=640 * 360, square=9)]
     runs = [run_of(load, "single", 1) for load in loads] + [run_of(loads[1], "single", 4)]
-    runs += [run_of(loads[0], "pipelined", 1)]
+    runs += [run_of(loads[0], "pipelined", 1), run_of(loads[1], "pipelined", 8)]
     machine = Machine(cores=8)
     fitted = fit_messages(fit_costs(runs), runs, machine)
     for stage, cost in fitted.stages.items():
         assert cost.residual < 1e-6
-        for name in ("point", "merged pixel", "entry"):
+        for name in ("point", "cold point", "merged pixel", "entry"):
             if name in cost.seconds:
                 assert cost.seconds[name] == pytest.approx(TRUE.stages[stage].seconds[name], rel=0.01)
     assert fitted.contention == pytest.approx(0.1, rel=0.05)
     assert fitted.loop_s == pytest.approx(1e-4, rel=0.01)
     assert fitted.message_s == pytest.approx(3e-5, rel=0.1)
+    assert fitted.late_s == pytest.approx(1e-3, rel=0.1)
     for setting in (Setting("single", 2, 4), Setting("pipelined", 2, 4), Setting("pipelined", 1, 1)):
         other = load_of(9, 5e6)
         found = forecast(fitted, other, setting, machine).frames_per_s
@@ -229,6 +240,19 @@ def test_one_core_shared_by_three_equal_stages_is_no_faster_than_one_rank():
     }
     assert rates[3] == pytest.approx(100, rel=0.1)
     assert 30 <= rates[1] <= 50, "mean-value: the share of a core that each gets is not exact"
+
+
+def test_a_late_thread_costs_no_more_than_drawing_with_one():
+    load, machine = load_of(points=1e5), Machine(2)
+    rates = {
+        late_s: forecast(replace(TRUE, late_s=late_s), load, Setting("pipelined", 2, 4), machine).frames_per_s
+        for late_s in (0.0, 1e-4, 1.0)
+    }
+    assert rates[0.0] > rates[1e-4] > rates[1.0]
+    one = forecast(TRUE, load, Setting("pipelined", 1, 4), machine).frames_per_s
+    assert rates[1.0] == pytest.approx(one, rel=0.25), "as much work; the other thread still contends for memory"
+    alone = [forecast(replace(TRUE, late_s=s), load, Setting("single", 2, 4), machine).frames_per_s for s in (0.0, 1.0)]
+    assert alone[0] == alone[1], "nobody else wakes"
 
 
 def test_bandwidth_latency_and_speed_work_as_they_should():
@@ -286,6 +310,8 @@ def test_the_workload_is_what_a_run_counts(config):
     record = measured_run(config, ["pipeline.topology=single"])
     for name in ("cells_visible", "entries", "points"):
         assert getattr(load, name).tolist() == record["per_frame"][name]
+    assert (load.cold <= load.points).all()
+    assert (load.cold >= np.minimum(load.points, COLD_POINTS)).all(), "the first entry's first points are cold"
     assert load.cells == record["scene"]["cells"]
 
 
@@ -321,7 +347,7 @@ def test_what_if_changes_one_thing(config):
     assert rate("points=2000000000") < rate("points=200000") < base
     assert rate("speed=3") > base
     assert rate("camera.width=1600") < base
-    assert rate("sampling.pixel_threshold=0") < base
+    assert rate("sampling.pixel_threshold=4096") > base
     assert changed(case, str(config), [], "cores=16").machine.cores == 16
     assert changed(case, str(config), [], "latency=1e-3").costs.message_s == 1e-3
     assert changed(case, str(config), [], "bandwidth=1e6").machine.bandwidth_bytes_per_s == 1e6

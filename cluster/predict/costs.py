@@ -4,7 +4,7 @@ Model of one frame's work, alone on the machine with one thread:
 
     culling  = a + b · cells + c · visible cells
     sampling = a + b · cells + c · visible cells + d · entries
-    render   = a + b · entries + c · points + d · covered pixels + e · merged pixels
+    render   = a + b · entries + c · points + d · cold points + e · covered pixels + f · merged pixels
 
 With t threads the render node uses u ≤ t framebuffers (``framebuffers_used``): points and covered pixels are divided
 by u, merged pixels are pixels · u / t. What the threads lose to each other (memory bandwidth, shared cores of a core
@@ -61,12 +61,15 @@ class Costs:
     loop_s : seconds a frame outside the stages: camera, statistics, progress.
     message_s : software latency: seconds a rank is busy, or late, for each message it sends or receives.
     contention : slow-down of a busy core by each other busy core, ≥ 0.
+    late_s : seconds a frame that a rank with a thread on every core loses where other ranks share the cores: a thread
+        that is woken on a core where one is working waits there for the next tick of the operating system.
     """
 
     stages: dict[str, StageCost]
     loop_s: float
     message_s: float
     contention: float
+    late_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -113,6 +116,7 @@ def stage_columns(load: Workload, threads: int) -> dict[str, Columns]:
             "frame": one,
             "entry": load.entries,
             "point": load.points / used,
+            "cold point": load.cold / used,
             "covered pixel": (load.covered - load.points) / used,
             "merged pixel": load.pixels * used / threads,
         },
@@ -126,7 +130,7 @@ def framebuffers_used(load: Workload, threads: int) -> np.ndarray:
 
 
 def fit_costs(runs: Sequence[Measured]) -> Costs:
-    """Costs from runs on one rank, those with several threads included. ``message_s`` is 0.
+    """Costs from runs on one rank, those with several threads included. ``message_s`` and ``late_s`` are 0.
 
     Raises InputError if no run is ``single`` with one thread.
     """

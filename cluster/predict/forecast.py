@@ -5,8 +5,9 @@ latency of each message it sends or receives; a message's bytes are under way fo
 
 **Cores that ranks share.** While a stage works, b cores are busy: its own threads, and the threads of each other rank
 for the share of time that it works. Its work then takes max(1, b / cores) · (1 + contention · (min(b, cores) − 1))
-times as long. Shares depend on the schedule and the schedule on the shares; they are iterated to a fixed point. That is
-a mean-value model: it knows neither which frames meet nor how the kernel of the operating system chooses.
+times as long. A rank with a thread on every core loses ``late_s`` more to the other ranks, but is never slower than
+with one thread. Shares depend on the schedule and the schedule on the shares; they are iterated to a fixed point. That
+is a mean-value model: it knows neither which frames meet nor how the kernel of the operating system chooses.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ MESSAGES = {"culling": 4, "sampling": 3, "render": 3}
 render-points; camera, render-points and a note."""
 
 ROUNDS = 30
-MAX_MESSAGE_S = 20e-3
+LOSSES_S = np.concatenate([[0.0], np.geomspace(5e-6, 10e-3, 100)])
+"""Losses around a message or a woken thread that are tried: up to the longest tick of an operating system."""
 
 
 @dataclass(frozen=True)
@@ -91,8 +93,13 @@ def forecast(costs: Costs, load: Workload, setting: Setting, machine: Machine) -
     }
     fixed = {stage: MESSAGES[stage] * message_s + (loop_s if stage == "culling" else 0.0) for stage in STAGES}
     factor: dict[str, float] = dict.fromkeys(STAGES, 1.0)
+    crowded = setting.threads >= machine.cores > 1
+    one_thread = costs.stages["render"].of(stage_columns(load, 1)["render"]) / machine.speed
     for _ in range(ROUNDS):
-        stages = [Stage(s, alone[s] * factor[s] + fixed[s], link_s=links[s]) for s in STAGES]
+        work = {s: alone[s] * factor[s] for s in STAGES}
+        if crowded:
+            work["render"] = np.minimum(work["render"] + costs.late_s, one_thread * factor["render"])
+        stages = [Stage(s, work[s] + fixed[s], link_s=links[s]) for s in STAGES]
         schedule = run_schedule(stages, in_flight=setting.in_flight)
         busy = {s: float(alone[s].sum()) * factor[s] / schedule.total_s * threads[s] for s in STAGES}
         wanted = {
@@ -106,34 +113,27 @@ def forecast(costs: Costs, load: Workload, setting: Setting, machine: Machine) -
 
 
 def fit_messages(costs: Costs, runs: Sequence[Measured], machine: Machine) -> Costs:
-    """The costs with the software latency that brings the forecasts of the pipelined runs nearest to the measured ones.
+    """The costs with what ranks lose to each other, so that forecasts come nearest to the measured pipelined runs.
 
-    Nearest by the sum of relative errors, so the median of what each run asks for, weighted by its frames/s. The figure
-    holds whatever a rank loses around a message: packing, polling, waking late. No pipelined run: costs unchanged.
+    ``message_s`` from the runs that leave a core free of render threads, then ``late_s`` from the others: of
+    ``LOSSES_S`` those with the least sum of squared relative errors. The software latency holds whatever a rank loses
+    around a message: packing, polling, waking late. Where there is no run, costs unchanged.
     """
     pipelined = [run for run in runs if run.topology == "pipelined"]
-    if not pipelined:
-        return costs
-    found = []
-    for run in pipelined:
-        setting = Setting("pipelined", run.threads, run.config.pipeline.frames_in_flight)
-        found.append(_latency_that_gives(run.frame_s, costs, run.load, setting, machine))
-    order = np.argsort(found)
-    weight = np.cumsum([1 / pipelined[i].frame_s for i in order])
-    return replace(costs, message_s=found[order[np.searchsorted(weight, weight[-1] / 2)]])
+    for name, group in (
+        ("message_s", [run for run in pipelined if run.threads < machine.cores]),
+        ("late_s", [run for run in pipelined if run.threads >= machine.cores]),
+    ):
+        if group:
+            tried = [replace(costs, **{name: seconds}) for seconds in LOSSES_S.tolist()]
+            costs = min(tried, key=lambda of: sum(_error(of, run, machine) ** 2 for run in group))
+    return costs
 
 
-def _latency_that_gives(frame_s: float, costs: Costs, load: Workload, setting: Setting, machine: Machine) -> float:
-    """By bisection: frame time grows with latency. 0 if the forecast is slower than measured even without."""
-    low, high = 0.0, MAX_MESSAGE_S
-    for _ in range(16):
-        middle = (low + high) / 2
-        predicted = forecast(replace(costs, message_s=middle), load, setting, machine)
-        if 1 / predicted.frames_per_s > frame_s:
-            high = middle
-        else:
-            low = middle
-    return low
+def _error(costs: Costs, run: Measured, machine: Machine) -> float:
+    """(predicted − measured) / measured frames/s."""
+    setting = Setting(run.topology, run.threads, run.config.pipeline.frames_in_flight)
+    return forecast(costs, run.load, setting, machine).frames_per_s * run.frame_s - 1
 
 
 def _inflation(busy: float, contention: float, cores: int) -> float:

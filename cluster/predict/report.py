@@ -33,7 +33,8 @@ def add_costs(report: Report, costs: Costs) -> None:
     report.table(["stage", "of one", "ns", "residual (rms, of the mean)"], rows)
     report.text(
         f"Outside the stages {1e3 * costs.loop_s:.3g} ms a frame; {1e6 * costs.message_s:.3g} µs a message sent or "
-        f"received; each further busy core slows a core by {costs.contention:.1%}."
+        f"received; each further busy core slows a core by {costs.contention:.1%}; other ranks on the cores of a rank "
+        f"with a thread on each cost it {1e3 * costs.late_s:.3g} ms a frame."
     )
 
 

@@ -16,6 +16,10 @@ from ...shared.camera import Camera
 from ...shared.messages import HEADER, RenderPoints, encode
 from ..job import Job
 
+COLD_POINTS = 256
+"""Points at the start of an entry that are read before the memory's prefetchers have caught up with it: the four
+columns of an entry start on pages of their own."""
+
 SAMPLED_POINTS = 4096
 """Points whose size on the screen stands for all of a frame's, where size depends on distance."""
 
@@ -26,6 +30,7 @@ class Workload:
 
     cells : of the octree.
     cells_visible, entries, points : a frame's bits set, render-points entries, points drawn.
+    cold : of the points, those among the first ``COLD_POINTS`` of an entry.
     covered : pixels that the frame's points write, each as often as it is written.
     pixels : of the picture.
     visibility_bytes, render_points_bytes : message sizes, header included.
@@ -36,6 +41,7 @@ class Workload:
     cells_visible: np.ndarray
     entries: np.ndarray
     points: np.ndarray
+    cold: np.ndarray
     covered: np.ndarray
     visibility_bytes: float
     render_points_bytes: np.ndarray
@@ -47,7 +53,16 @@ class Workload:
 
     def scaled(self, factor: float) -> Workload:
         """The workload of a scene with ``factor`` times the points, seen the same way: cells and entries grow too."""
-        grown = ("cells", "cells_visible", "entries", "points", "covered", "visibility_bytes", "render_points_bytes")
+        grown = (
+            "cells",
+            "cells_visible",
+            "entries",
+            "points",
+            "cold",
+            "covered",
+            "visibility_bytes",
+            "render_points_bytes",
+        )
         return replace(self, **{name: getattr(self, name) * factor for name in grown})
 
 
@@ -55,19 +70,20 @@ def count_workload(job: Job) -> Workload:
     """The workload of a job. Cost: culling and sampling of each frame, a few milliseconds."""
     octree = job.scene.octree()
     culling, sampling = job.culling_node(octree), job.sampling_node(octree)
-    visible, entries, points, covered, sizes = np.zeros((5, job.n_frames))
+    visible, entries, points, cold, covered, sizes = np.zeros((6, job.n_frames))
     for frame in range(job.n_frames):
         camera = job.camera(frame)
         bits = culling.process(camera)
         chosen = sampling.process(camera, bits)
         visible[frame] = np.bitwise_count(bits.bits).sum()
         entries[frame], points[frame] = len(chosen.entries), chosen.n_points
+        cold[frame] = np.minimum(_counts(chosen.entries), COLD_POINTS).sum()
         covered[frame] = chosen.n_points * _pixels_per_point(job, camera, chosen)
         head, payload = encode(chosen)
         sizes[frame] = len(head) + len(payload)
     pixels = job.config.camera.width * job.config.camera.height
     bits_bytes = HEADER.size + (len(octree) + 7) // 8
-    return Workload(len(octree), pixels, visible, entries, points, covered, bits_bytes, sizes)
+    return Workload(len(octree), pixels, visible, entries, points, cold, covered, bits_bytes, sizes)
 
 
 def threads_of(render_threads: int) -> int:
@@ -93,8 +109,13 @@ def _pixels_per_point(job: Job, camera: Camera, chosen: RenderPoints) -> float:
 def _sample(entries: Any, n_points: int) -> np.ndarray:
     """Indices into the point-array of up to ``SAMPLED_POINTS`` of the chosen points, evenly spread over them."""
     ordinal = np.linspace(0, n_points - 1, min(n_points, SAMPLED_POINTS)).astype(np.int64)
-    stride = entries["stride"].astype(np.int64)
-    counts = -(-entries["range"].astype(np.int64) // stride)
+    counts = _counts(entries)
     ends = np.cumsum(counts)
     entry = np.searchsorted(ends, ordinal, side="right")
-    return entries["offset"][entry].astype(np.int64) + (ordinal - (ends - counts)[entry]) * stride[entry]
+    stride = entries["stride"][entry].astype(np.int64)
+    return entries["offset"][entry].astype(np.int64) + (ordinal - (ends - counts)[entry]) * stride
+
+
+def _counts(entries: Any) -> np.ndarray:
+    """(m,) int64: points that each of (m,) RENDER_POINT entries draws."""
+    return -(-entries["range"].astype(np.int64) // entries["stride"].astype(np.int64))
