@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ..nodes.culling import CullingNode
+from ..nodes.point_filter import PointFilter
 from ..nodes.raster import PointSize, SplatSettings
 from ..nodes.raster.choose import make_rasterizer
 from ..nodes.raster.cpu import kernels_cached
@@ -49,13 +50,17 @@ class Job:
         )
         self.splats = SplatSettings(**dict(config.splats)) if render.style == "splats" else None
         self.compact = render.positions == "compact"
+        self.point_filter = PointFilter.choose(self.scene, config.filter.classes, config.filter.boxes)
         self.wanted = Wanted(
             splats=self.splats is not None,
             features=self.splats is not None and self.splats.features,
             cells=self.compact or render.point_size_adaptive,
+            point_filter=self.point_filter,
         )
         self.background = parse_colour(render.background, "render.background")
-        self.colouring = Colouring.choose(self.scene, render.colour, render.colormap, render.colour_range)
+        self.colouring = Colouring.choose(
+            self.scene, render.colour, render.colormap, render.colour_range, render.class_colours
+        )
         self._path = camera_path(config.camera, info, self.n_frames)
 
     def camera(self, frame: int) -> Camera:
@@ -65,7 +70,7 @@ class Job:
     def culling_node(self, octree: Octree) -> CullingNode:
         """The culling node of this run."""
         margin_px = self.largest_point_px / 2 + 0.5  # a point just outside reaches in; and rounding moves it
-        return CullingNode(octree, backface=self.backface, margin_px=margin_px)
+        return CullingNode(octree, backface=self.backface, margin_px=margin_px, point_filter=self.point_filter)
 
     def sampling_node(self, octree: Octree) -> SamplingNode:
         """The sampling node of this run."""
@@ -103,7 +108,13 @@ class Job:
     @property
     def attributes_read(self) -> set[str]:
         """Attributes of the scene that this run reads."""
-        return {name for name in (self.colouring.attribute, "normal" if self.backface else None) if name}
+        read = {
+            self.colouring.attribute: True,
+            "normal": self.backface or self.splats is not None,
+            "radius": self.splats is not None,
+            "classification": bool(self.point_filter.classes),
+        }
+        return {name for name, is_read in read.items() if name is not None and is_read}
 
     def outputs(self) -> list[str]:
         """What the run has written, for people."""

@@ -14,6 +14,7 @@ from numba import njit
 from ..shared.camera import Camera
 from ..shared.messages import VisibilityBits
 from ..shared.octree import MAX_LEVEL, Octree
+from .point_filter import PointFilter
 
 N_PLANES = 5
 _PLANES = np.uint8((1 << N_PLANES) - 1)
@@ -31,9 +32,17 @@ class CullingNode:
     backface : leave out cells whose normals all face away; without effect on an octree that has no cones.
     margin_px : how far outside the image a point's centre may lie and still colour a pixel: half the largest
         point side, plus the rasterizer's rounding. ≥ 0.
+    point_filter : its boxes leave out cells too.
     """
 
-    def __init__(self, octree: Octree, *, backface: bool, margin_px: float = 1.0):
+    def __init__(
+        self,
+        octree: Octree,
+        *,
+        backface: bool,
+        margin_px: float = 1.0,
+        point_filter: PointFilter = PointFilter(),  # noqa: B008 (frozen)
+    ):
         self._centers = octree.centers
         self._level = octree.level
         self._parent = octree.parent
@@ -41,13 +50,14 @@ class CullingNode:
         use_cone = backface and octree.cone is not None
         self._cone = octree.cone if use_cone else np.empty((0, 4), np.float32)
         self._undecided = np.empty(len(octree), np.uint8)
+        self._left = point_filter.cells_left(octree, self._half_edge)
         self.margin_px = margin_px
 
     def process(self, camera: Camera) -> VisibilityBits:
         """The bits of one frame: 1 where a cell may be seen; the ancestors of such a cell are 1 too.
 
-        Conservative: a cell is 0 only if no point below it is nearer than ``near`` allows, falls within
-        ``margin_px`` of the image and faces the eye.  Cost: O(cells), about 2–5 ns each.
+        Conservative: a cell is 0 only if no point below it is left by the boxes, nearer than ``near`` allows, falls
+        within ``margin_px`` of the image and faces the eye.  Cost: O(cells), about 2–5 ns each.
         """
         planes = frustum_planes(camera, self.margin_px)
         _cull(
@@ -60,7 +70,10 @@ class CullingNode:
             planes,
             self._undecided,
         )
-        return VisibilityBits.pack(camera.frame, self._undecided != _OUTSIDE)
+        visible = self._undecided != _OUTSIDE
+        if self._left is not None:
+            visible &= self._left
+        return VisibilityBits.pack(camera.frame, visible)
 
 
 def padded_half_edges(octree: Octree) -> np.ndarray:

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 
 import numpy as np
 
@@ -48,6 +49,7 @@ CLASS_COLOURS = {
 }
 """Colours of the ASPRS classes (LAS 1.4 R15, table 17)."""
 _OTHER_CLASS = "#00bcd4"  # 19–255: reserved and user-defined
+_CLASS_CODES = [str(code) for code in range(256)]
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,7 @@ class Colouring:
     attribute : the attribute it reads, or None.
     colormap : of the scalar modes.  value_range : values at its two ends; None: found from the points.
     word : the colour of mode ``constant``.
+    class_colours : colours of class codes, in place of ``CLASS_COLOURS``.
     """
 
     mode: str
@@ -65,17 +68,26 @@ class Colouring:
     colormap: str
     value_range: tuple[float, float] | None
     word: np.uint32
+    class_colours: Mapping[int, str] = field(default_factory=dict)
 
     @classmethod
     def choose(
-        cls, scene: Scene, mode: str, colormap: str = "viridis", value_range: tuple[float, float] | None = None
+        cls,
+        scene: Scene,
+        mode: str,
+        colormap: str = "viridis",
+        value_range: tuple[float, float] | None = None,
+        class_colours: Mapping[str, str] = MappingProxyType({}),
     ) -> Colouring:
         """The colouring that a configuration asks for.
 
         ``auto`` takes the first that tells something: rgb, then normal, then intensity, then elevation; an attribute
         with one value everywhere tells nothing.
 
-        Raises ConfigError for an unknown mode or colour map, an attribute the scene lacks, or an empty range.
+        class_colours : by code as text, ``"0"`` … ``"255"``.
+
+        Raises ConfigError for an unknown mode or colour map, an attribute the scene lacks, an empty range, or what is
+        no class or colour.
         """
         word = np.uint32(0)
         if mode == "auto":
@@ -93,7 +105,7 @@ class Colouring:
             raise ConfigError(f"render.colour_range = {list(value_range)}, expected two different numbers")
         if mode in _COLOUR_MAPPED:
             _colormap(colormap)
-        return cls(mode, attribute, colormap, value_range, word)
+        return cls(mode, attribute, colormap, value_range, word, _class_colours(class_colours))
 
     def settled(self, scene: Scene) -> Colouring:
         """The same with its range of values found, so that other copies of the scene's points get the same colours."""
@@ -115,7 +127,7 @@ def colour_words(scene: Scene, colouring: Colouring) -> np.ndarray:
         case "constant":
             return np.broadcast_to(colouring.word, n)
         case "classification":
-            palette = _class_palette()
+            palette = _class_palette({**CLASS_COLOURS, **colouring.class_colours})
             codes = scene.attribute("classification")
             return _by_chunk(n, lambda part: palette[codes[part]])
         case "normal":
@@ -258,10 +270,25 @@ def _robust_range(values: Callable[[_Part], np.ndarray], n: int) -> tuple[float,
     return float(low), float(high)
 
 
-def _class_palette() -> np.ndarray:
+def _class_colours(table: Mapping[str, str]) -> dict[int, str]:
+    """Colours by class code. Raises ConfigError naming the key of what is no class or no colour."""
+    found = {}
+    for code, colour in table.items():
+        key = f"render.class_colours.{code}"
+        if code not in _CLASS_CODES:
+            raise ConfigError(f"{key}: found class {code!r}, expected a code of 0…255")
+        if parse_colour(colour, key)[3] == 0:
+            raise ConfigError(
+                f"{key} = {colour!r}, expected #rrggbb or a colour name; filter.classes leaves out points"
+            )
+        found[int(code)] = colour
+    return found
+
+
+def _class_palette(colours: Mapping[int, str]) -> np.ndarray:
     """(256,) uint32 colour word of each class code."""
-    colours = np.array([parse_colour(CLASS_COLOURS.get(code, _OTHER_CLASS), "class") for code in range(256)])
-    return colours.view("<u4").ravel()
+    rgba = np.array([parse_colour(colours.get(code, _OTHER_CLASS), "class") for code in range(256)])
+    return rgba.view("<u4").ravel()
 
 
 def _colormap(name: str) -> np.ndarray:
