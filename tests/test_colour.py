@@ -174,6 +174,31 @@ def test_what_cannot_be_done_is_said_in_one_line(make_scene, columns, mode, opti
     assert "\n" not in str(caught.value)
 
 
+def test_classes_have_the_colours_that_a_run_gives_them(make_scene, columns):
+    scene = make_scene({"classification": columns["classification"]})
+    own = {"2": "#010203", "200": "white"}
+    words = colour_words(scene, Colouring.choose(scene, "classification", class_colours=own))
+    codes = np.asarray(scene.attribute("classification"))
+    np.testing.assert_array_equal(unpack_rgb(words[codes == 2]) == [1, 2, 3, 255], True)
+    np.testing.assert_array_equal(words[codes != 2], words_of(scene, "classification")[codes != 2])
+
+
+@pytest.mark.parametrize(
+    ("key", "colour", "message"),
+    [
+        ("256", "red", r"render\.class_colours\.256: found class '256', expected a code of 0…255"),
+        ("02", "red", r"render\.class_colours\.02: found class '02'"),
+        ("ground", "red", r"render\.class_colours\.ground: found class 'ground'"),
+        ("6", "rde", r"render\.class_colours\.6 = 'rde', expected #rrggbb"),
+        ("6", "transparent", r"render\.class_colours\.6 = 'transparent', expected #rrggbb .*; filter\.classes"),
+    ],
+)
+def test_colours_of_no_class_and_no_colours_are_refused(make_scene, columns, key, colour, message):
+    scene = make_scene({"intensity": columns["intensity"]})
+    with pytest.raises(ConfigError, match=message):
+        Colouring.choose(scene, "intensity", class_colours={"1": "blue", key: colour})
+
+
 def test_values_that_are_no_numbers_and_constant_values_have_a_colour(make_scene, columns):
     table = np.arange(256, dtype=np.uint32)
     values = np.array([np.nan, -np.inf, np.inf, 0.0, 0.5, 1.0, 7.0], np.float32)

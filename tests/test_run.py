@@ -75,6 +75,36 @@ def test_three_ranks_draw_the_same_bits_as_one(scenes, config, tmp_path, order):
 
 @needs_mpi
 @pytest.mark.mpi
+@pytest.mark.parametrize(
+    "filters",
+    [
+        {"filter.classes": [2, 6]},
+        {"filter.boxes": "[{ lower = [40, 40, -1], upper = [180, 180, 500] }]"},
+        {
+            "filter.classes": [6],
+            "filter.boxes": "[{ lower = [-1e3, -1e3, -9], upper = [150, 150, 99], keep = 'outside' }]",
+        },
+    ],
+    ids=["classes", "box", "both"],
+)
+def test_three_ranks_filter_as_one_does(config, tmp_path, filters):
+    run = {}
+    for name, settings in (("all", {}), ("single", filters), ("pipelined", filters)):
+        topology = {"pipeline.topology": "pipelined" if name == "pipelined" else "single"}
+        done = call(*command(config, tmp_path / name, **topology, **settings, **{"render.colour": "classification"}))
+        assert done.returncode == 0, done.stderr
+        run[name] = json.loads((tmp_path / name / "run.json").read_text())
+    one, three = pictures(tmp_path / "single"), pictures(tmp_path / "pipelined")
+    assert np.array_equal(one, three)
+    shown = np.ptp(one.reshape(-1, 3), axis=0).max() > 0
+    assert shown, "something is left"
+    assert (one != pictures(tmp_path / "all")).any(axis=-1).mean() > 0.05
+    fewer = run["single"]["per_frame"]["cells_visible"][0] < run["all"]["per_frame"]["cells_visible"][0]
+    assert fewer == ("filter.boxes" in filters), "boxes spare cells, classes do not"
+
+
+@needs_mpi
+@pytest.mark.mpi
 def test_the_record_says_where_time_and_bytes_went(config, tmp_path):
     copy = tmp_path / "copy.json"
     done = call(*command(config, tmp_path / "out", **{"pipeline.topology": "pipelined"}), "--json", str(copy))
