@@ -30,3 +30,7 @@ class MessageError(SplatpipeError):
 
 class DeviceError(SplatpipeError):
     """A device (OpenGL, MPI) is missing or failed; the message says what to install or set."""
+
+
+class CodecError(SplatpipeError):
+    """Encoded cells are damaged, or what is to be encoded does not suit the codec."""

@@ -1,0 +1,56 @@
+"""Cell codecs: other ways to hold the positions of a cell's points than three float32.
+
+A codec works on *grid points*: whole coordinates 0 … 2**bits − 1 an axis inside a cell's cube. Going there from positions
+and back is ``grid``, the same for all. What the papers behind them call a cell, a cube or a pool stays inside each
+codec's own module.
+
+======================  ==================================================================================
+module                  source
+======================  ==================================================================================
+``grid``                positions ↔ grid points, and the order of points that codecs change
+======================  ==================================================================================
+
+Data that comes from a file or a socket is never believed: decoders raise ``CodecError`` on anything that no encoder
+writes, and allocate no more than the caller's bound on the number of points allows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+MAX_BITS = 21
+"""Most bits an axis: three of them fit a Morton code of 63."""
+
+
+@dataclass(frozen=True)
+class Encoded:
+    """A cell's grid points in the form of one codec.
+
+    data : (m,) uint8, everything that decoding needs but ``bits``.
+    order : (n,) int64: the i-th decoded point is point ``order[i]`` of what was encoded, so that attributes can follow.
+    """
+
+    data: np.ndarray
+    order: np.ndarray
+
+    @property
+    def bits_per_point(self) -> float:
+        """Bits of ``data`` for each point; not a number where there is none."""
+        return 8 * len(self.data) / len(self.order) if len(self.order) else float("nan")
+
+
+class Codec(Protocol):
+    """What every codec of grid points offers."""
+
+    name: str
+
+    def encode(self, points: np.ndarray, bits: int) -> Encoded:
+        """(n, 3) integers in [0, 2**bits), duplicates allowed. Raises CodecError for anything else."""
+        ...
+
+    def decode(self, data: np.ndarray, bits: int, most_points: int) -> np.ndarray:
+        """(n, 3) uint32 grid points, in coded order. Raises CodecError for damaged data or above ``most_points``."""
+        ...
