@@ -11,6 +11,7 @@ from ..shared.colour import Colouring, colour_words
 from ..shared.errors import MessageError
 from ..shared.messages import RENDER_POINT, RenderPoints
 from ..shared.store import Scene
+from .cell_blocks import cell_blocks, cell_spacing
 from .point_filter import PointFilter
 from .raster import Rasterizer, ResidentPoints
 
@@ -45,13 +46,14 @@ class Wanted:
     """What a run needs of the points besides position and colour; nothing else is loaded.
 
     splats : normals and radii.  features : classes and quads of the cells.
-    cells : blocks as single cells, with the spacing of their points.
+    cells : blocks as single cells.  spacing : the spacing of their points.
     point_filter : which points are drawn at all; the others get NaN as their x.
     """
 
     splats: bool = False
     features: bool = False
     cells: bool = False
+    spacing: bool = False
     point_filter: PointFilter = field(default_factory=PointFilter)
 
 
@@ -68,7 +70,14 @@ def load_points(scene: Scene, colouring: Colouring, wanted: Wanted = Wanted(), *
     x, y, z = scene.positions()
     if wanted.point_filter:
         x = wanted.point_filter.filtered_x(scene, x, y, z)
-    block_first_point, block_origin, block_spacing = _cell_blocks(scene) if wanted.cells else (*scene.blocks(), None)
+    block_spacing = None
+    if wanted.cells:
+        octree = scene.octree()
+        block_first_point, block_origin, cells = cell_blocks(scene, octree)
+        if wanted.spacing:
+            block_spacing = cell_spacing(scene, octree, cells)
+    else:
+        block_first_point, block_origin = scene.blocks()
     return ResidentPoints(
         x,
         y,
@@ -79,22 +88,3 @@ def load_points(scene: Scene, colouring: Colouring, wanted: Wanted = Wanted(), *
         root_edge=scene.info.edge,
         block_spacing=block_spacing,
     )
-
-
-def _cell_blocks(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Blocks as single cells: (b,) first point, (b, 3) origin, (b,) float32 spacing of the cell's points.
-
-    A cell's origin is that of the block it is stored in, so no coordinate changes.
-
-    The spacing is √(area / points) of the cell's own set, with the area of a surface that crosses its cube: edge². It
-    is that of the whole set, also where only its head is drawn: a cell of N pixels is cut only if it draws the
-    ⌊N ln N⌋ points that cover them, one a pixel and more.
-    """
-    octree = scene.octree()
-    owners = np.flatnonzero(octree.n_points if octree.point_order == "layered" else octree.is_leaf)
-    owners = owners[np.argsort(octree.first_point[owners])]
-    first, origin = scene.blocks()
-    own_first = octree.first_point[owners]
-    block = np.searchsorted(first, own_first, side="right") - 1
-    spacing = 2 * octree.half_edges[owners] / np.sqrt(octree.n_points[owners])
-    return own_first, origin[block], spacing.astype(np.float32)

@@ -224,22 +224,3 @@ def test_what_makes_no_sense_is_refused(make_scene, tmp_path):
     build_scene([ArraySource(np.eye(3))], tmp_path / "bare.scene")
     with pytest.raises(ConfigError, match=r"filter\.classes = \[2\]: the scene has no attribute, expected classific"):
         PointFilter.choose(Scene.open(tmp_path / "bare.scene"), [2], [])
-
-
-@pytest.mark.parametrize("order", ["layered", "depth-first"])
-def test_blocks_as_single_cells_move_no_point_and_know_their_spacing(make_scene, order):
-    scene = make_scene(6.4e6, order)
-    colouring = Colouring.choose(scene, "elevation")
-    points = load_points(scene, colouring, Wanted(cells=True), verify=False)
-    octree = scene.octree()
-    owners = octree.n_points > 0 if order == "layered" else octree.is_leaf
-    assert len(points.block_first_point) == owners.sum()
-    block = np.searchsorted(points.block_first_point, np.arange(len(points)), side="right") - 1
-    world = points.block_origin[block] + np.column_stack([points.x, points.y, points.z]).astype(np.float64)
-    np.testing.assert_array_equal(world, world_of(scene))
-    for cell in np.flatnonzero(owners)[:: max(1, owners.sum() // 50)]:
-        i = int(np.searchsorted(points.block_first_point, octree.first_point[cell]))
-        assert points.block_first_point[i] == octree.first_point[cell]
-        spacing = 2 * octree.half_edges[cell] / octree.n_points[cell] ** 0.5
-        assert points.block_spacing[i] == pytest.approx(spacing, rel=1e-6)
-    assert load_points(scene, colouring, verify=False).block_spacing is None

@@ -39,7 +39,8 @@ class CellFeatures:
 class ResidentPoints:
     """The render rank's half of a scene: points relative to the origin of their block, no octree.
 
-    x, y, z : (n,) float32, relative to the block's origin, world units. May be memory-mapped.
+    x, y, z : (n,) float32, relative to the block's origin, world units. May be memory-mapped. A point whose x is NaN
+        is not drawn (``point_filter``), in whatever form a rasterizer holds it.
     colour : (n,) uint32 colour words.
     block_first_point : (b,) int64, ascending, the first is 0: block i holds points
         block_first_point[i] … block_first_point[i + 1] − 1 (the last one: to the end).
@@ -49,8 +50,8 @@ class ResidentPoints:
     normal : (n,) uint32 octahedral words (``points.pack_normals``): splats.
     radius : (n,) uint8 codes (``points.pack_radii`` with ``root_edge``): splats.
     root_edge : edge of the scene's root cube, world units.
-    block_spacing : (b,) float32, distance between neighbouring points of each block, world units: adaptive point size.
-        Blocks are single cells then.
+    block_spacing : (b,) float32, side of squares that leave no gap between the points of each block, world units:
+        adaptive point size. Blocks are single cells then.
     features : what cells look like: feature-driven splats.
     """
 
