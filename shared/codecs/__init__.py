@@ -1,8 +1,8 @@
 """Cell codecs: other ways to hold the positions of a cell's points than three float32.
 
-A codec works on *grid points*: whole coordinates 0 … 2**bits − 1 an axis inside a cell's cube. Going there from positions
-and back is ``grid``, the same for all. What the papers behind them call a cell, a cube or a pool stays inside each
-codec's own module.
+A codec works on *grid points*: whole coordinates 0 … 2**bits − 1 an axis inside a cell's cube. Going there from
+positions and back is ``grid``, the same for all. What the papers behind them call a cell, a cube or a pool stays
+inside each codec's own module.
 
 ======================  ==================================================================================
 module                  source

@@ -20,7 +20,7 @@ def check_points(points: np.ndarray, bits: int) -> np.ndarray:
     points = np.asarray(points)
     if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "ui":
         raise CodecError(f"grid points: found {points.dtype} {points.shape}, expected integers (n, 3)")
-    if points.size and not (0 <= points.min() and points.max() < 1 << bits):
+    if points.size and (points.min() < 0 or points.max() >= 1 << bits):
         raise CodecError(f"grid points: found {points.min()} … {points.max()}, expected 0 … {(1 << bits) - 1}")
     return points.astype(np.uint32)
 
