@@ -65,26 +65,30 @@ def splat_columns(points: ResidentPoints) -> tuple[np.ndarray, np.ndarray]:
     return points.normal, points.radius
 
 
-def flat_cells(features: CellFeatures | None) -> np.ndarray:
-    """(f,) int64: the cells that are one quad in the visibility pass; ascending in points.
-
-    Raises InputError where a scene was built without features.
-    """
+def flat_cells(features: CellFeatures | None) -> CellFeatures:
+    """The cells that are one quad in the visibility pass. Raises InputError where a scene was built without."""
     if features is None:
         raise InputError("splats.features: found cells without features, expected them (splatpipe build --features)")
-    return np.flatnonzero((features.feature == FLAT) & (features.n_points > 0))
+    flat = (features.feature == FLAT) & (features.n_points > 0)
+    return CellFeatures(
+        features.first_point[flat],
+        features.n_points[flat],
+        features.feature[flat],
+        features.quad_center[flat],
+        features.quad_axes[flat],
+    )
 
 
-def drawn_cells(first: np.ndarray, end: np.ndarray, entries: np.ndarray) -> np.ndarray:
-    """(c,) bool: which of (c,) ascending ranges of points [first, end) share a point with (m,) RENDER_POINT entries.
+def drawn_cells(cells: CellFeatures, entries: np.ndarray) -> np.ndarray:
+    """(c,) bool: which cells' ranges share a point with those of (m,) RENDER_POINT entries.
 
     Cost: O(c + m log c); a stride counts as the whole of its range.
     """
     begin = entries["offset"].astype(np.int64)
     stop = begin + entries["range"]
-    a, b = np.searchsorted(end, begin, side="right"), np.searchsorted(first, stop, side="left")
-    used = stop > begin
-    steps = np.zeros(len(first) + 1, np.int64)
-    np.add.at(steps, a[used], 1)
-    np.add.at(steps, np.maximum(a, b)[used], -1)
+    first_cell = np.searchsorted(cells.first_point + cells.n_points, begin, side="right")
+    end_cell = np.searchsorted(cells.first_point, stop, side="left")
+    drawn = first_cell < end_cell
+    n_cells = len(cells.first_point)
+    steps = np.bincount(first_cell[drawn], minlength=n_cells + 1) - np.bincount(end_cell[drawn], minlength=n_cells + 1)
     return np.cumsum(steps[:-1]) > 0

@@ -91,14 +91,11 @@ def splat_frame(
 
     # 1. visibility
     front = np.full((camera.height, camera.width), np.inf)
-    if settings.features and points.features is not None:
-        cells = points.features
-        flat = flat_cells(cells)
-        first = cells.first_point[flat]
-        end = first + cells.n_points[flat]
-        cell = np.searchsorted(first, splats.index, side="right") - 1
-        in_first_pass = (cell < 0) | (splats.index >= end[cell])
-        for i in flat[drawn_cells(first, end, entries)]:
+    if settings.features:
+        cells = flat_cells(points.features)
+        cell = np.searchsorted(cells.first_point, splats.index, side="right")  # the last one that begins before, or 0
+        in_first_pass = splats.index >= np.append(0, cells.first_point + cells.n_points)[cell]
+        for i in np.flatnonzero(drawn_cells(cells, entries)):
             _draw_quad(front, camera, cells.quad_center[i], cells.quad_axes[i].astype(np.float64))
     for i in np.flatnonzero(in_first_pass):
         window, covered, depth, _ = fragments[i]
