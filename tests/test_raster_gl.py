@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from splatpipe.nodes.raster import PointSize, ResidentPoints, gl, gl_context
+from splatpipe.nodes.raster import PointSize, ResidentPoints, gl, gl_context, gl_resident
 from splatpipe.nodes.raster.cpu import CpuRasterizer
 from splatpipe.nodes.raster.gl import GlComputeRasterizer, GlPointsRasterizer
 from splatpipe.nodes.raster.gl_context import gl_available, is_software
@@ -110,7 +110,7 @@ class TestOnDevice:
             with rasterizer(points, WIDTH, HEIGHT) as whole:
                 expected = whole.draw(camera(), SOME).copy()
             with monkeypatch.context() as patch:
-                patch.setattr(gl, "storage_limit", lambda _: WIDTH * HEIGHT * 8)
+                patch.setattr(gl_resident, "storage_limit", lambda _: WIDTH * HEIGHT * 8)
                 patch.setattr(gl, "_BATCH_PIECES", 10)
                 patch.setattr(gl, "_PIECE_POINTS", 100)
                 with rasterizer(points, WIDTH, HEIGHT) as split:
@@ -215,7 +215,7 @@ class TestOnDevice:
             assert ours.resident_bytes == 16 * N_POINTS
 
     def test_a_frame_above_the_storage_limit_is_refused(self, points, monkeypatch):
-        monkeypatch.setattr(gl, "storage_limit", lambda _: 1 << 24)
+        monkeypatch.setattr(gl_resident, "storage_limit", lambda _: 1 << 24)
         with pytest.raises(DeviceError, match="found 33554432 bytes of framebuffer, expected at most 16777216"):
             GlComputeRasterizer(points, 2048, 2048)
 

@@ -1,20 +1,15 @@
-// What every program that draws points shares: one chunk of the point-array, the matrices of the blocks, and the
-// projection of a point. Put in front of the program's own source.
-// SQUARES: points cover more than one pixel.
-
-layout(std430, binding = 0) restrict readonly buffer PositionX { float x[]; };
-layout(std430, binding = 1) restrict readonly buffer PositionY { float y[]; };
-layout(std430, binding = 2) restrict readonly buffer PositionZ { float z[]; };
-layout(std430, binding = 3) restrict readonly buffer Colour { uint colour[]; };
-layout(std430, binding = 4) restrict readonly buffer Rows { mat3x4 rows[]; };  // columns are X, Y, W of a block
-
-const float FLOAT_MAX = 3.4028234e38;
+// The projection of a point; goes behind columns.glsl.
+// SQUARES: points cover more than one pixel.  ADAPTIVE: each block has a side of its own.
 
 uniform vec2 viewport;  // pixels
 uniform float near;
 #ifdef SQUARES
-uniform float world_px;      // side in world units × focal length in pixels; 0: fixed side
 uniform vec2 side_range_px;  // least, largest
+#ifdef ADAPTIVE
+layout(std430, binding = 8) restrict readonly buffer Sides { float world_px[]; };
+#else
+uniform float world_px;  // side in world units × focal length in pixels; 0: fixed side
+#endif
 #endif
 
 struct Square {
@@ -24,9 +19,25 @@ struct Square {
     uint depth;    // bits of the distance along the view axis
 };
 
+// The matrix and side of a block, fetched out of the loop over its points: a compiler may not know that they stay.
+struct Block {
+    mat3x4 rows;
+    float world_px;
+};
+
+Block block_at(uint place) {
+#if defined(ADAPTIVE)
+    return Block(rows[place], world_px[place]);
+#elif defined(SQUARES)
+    return Block(rows[place], world_px);
+#else
+    return Block(rows[place], 0.0);
+#endif
+}
+
 // The sums are written out and precise, so that they round as on the CPU.
-Square project(uint point, mat3x4 block) {
-    vec4 rx = block[0], ry = block[1], rw = block[2];
+Square project(uint point, Block block) {
+    vec4 rx = block.rows[0], ry = block.rows[1], rw = block.rows[2];
     float px = x[point], py = y[point], pz = z[point];
     precise float w = rw.x * px + rw.y * py + rw.z * pz + rw.w;
     precise float u = (rx.x * px + rx.y * py + rx.z * pz + rx.w) / w;
@@ -34,7 +45,8 @@ Square project(uint point, mat3x4 block) {
     precise vec2 corner = vec2(u, v);
     float side = 1.0;
 #ifdef SQUARES
-    side = world_px > 0.0 ? floor(clamp(world_px / w, side_range_px.x, side_range_px.y) + 0.5) : side_range_px.x;
+    side = block.world_px > 0.0
+        ? floor(clamp(block.world_px / w, side_range_px.x, side_range_px.y) + 0.5) : side_range_px.x;
     corner -= 0.5 * (side - 1.0);
 #endif
     corner = floor(corner);

@@ -1,0 +1,228 @@
+"""What the OpenGL rasterizers share: points resident in storage buffers, a frame's runs of points, allocations.
+
+A storage block has a largest size, so the point-array lies in *chunks* below it. A *run* is what an entry of
+render-points draws of one block within one chunk; runs and block matrices are all that a frame sends.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+
+from ...shared.camera import Camera
+from ...shared.errors import DeviceError, InputError
+from . import ResidentPoints, check_viewport
+from .gl_context import check_errors, open_context, storage_limit
+from .pieces import split_entries
+
+if TYPE_CHECKING:
+    import moderngl
+
+ROWS, RUNS = 4, 5
+"""Bindings behind x, y, z and colour, as in ``columns.glsl`` and ``runs.glsl``."""
+
+GROUP_SIZE = 64
+"""Invocations of a workgroup, as in the shaders."""
+
+RUN = np.dtype([("first", "<u4"), ("count", "<u4"), ("stride", "<u4"), ("block", "<u4"), ("first_unit", "<u4")])
+"""As in ``runs.glsl``. first: in the chunk; block: place of its matrix; first_unit: units of the runs before."""
+
+_MOST_POINTS = (1 << 32) - 1  # of a run
+
+
+@dataclass(frozen=True)
+class Batch:
+    """What one dispatch or draw works on: units of work of a frame's runs, all in one chunk."""
+
+    chunk: int
+    first_unit: int
+    n_units: int
+
+
+class GlResident(ABC):
+    """An OpenGL rasterizer: context, chunks of the point-array, block matrices, runs.
+
+    points : copied to the device; its columns may be released or unmapped afterwards.
+    columns : (n,) float32, uint32 or uint8 arrays of ``points``, in the order of their bindings.
+    borders : point numbers that no run crosses, besides those of blocks and chunks.
+    width, height : size of every frame, pixels.
+    device_index : in EGL's order; GLCONTEXT_DEVICE_INDEX wins.
+    Raises InputError: the viewport is empty or above the device's texture size.
+    Raises DeviceError: no OpenGL 4.5, not enough device memory, something above the storage-block limit.
+    To be used from the thread that made it.
+    """
+
+    name: str
+    _unit_points: int  # most points of a unit of work
+    _batch_units: int  # most units of a batch
+
+    def __init__(
+        self,
+        points: ResidentPoints,
+        columns: Sequence[np.ndarray],
+        width: int,
+        height: int,
+        device_index: int,
+        borders: np.ndarray | None = None,
+    ) -> None:
+        import moderngl
+
+        self._n_points = len(points)
+        self._shape = (height, width)
+        self._block_origin = points.block_origin
+        self._context = open_context(device_index)
+        try:
+            self.device = str(self._context.info["GL_RENDERER"])
+            self._limit = storage_limit(self._context)
+            most = self._context.info["GL_MAX_TEXTURE_SIZE"]
+            if not (1 <= width <= most and 1 <= height <= most):
+                raise InputError(f"viewport: found {width}×{height}, expected 1…{most} px a side")
+            self._most_groups = self._context.info["GL_MAX_COMPUTE_WORK_GROUP_COUNT"][0]
+            self._upload(points.block_first_point, columns, borders)
+            self._prepare()
+            check_errors(self._context, "setting up")
+        except moderngl.Error as error:
+            self.close()
+            raise DeviceError(f"OpenGL: {' '.join(str(error).split())}") from error
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Release the context and with it all device memory. May be called twice."""
+        self._context.release()
+
+    @property
+    def resident_bytes(self) -> int:
+        """Device memory that the point-array takes."""
+        return sum(column.size for chunk in self._chunks for column in chunk)
+
+    def draw(self, camera: Camera, entries: np.ndarray) -> np.ndarray:
+        """(height, width) uint64 framebuffer words, row 0 on top; valid until the next call.
+
+        entries : (m,) RENDER_POINT.
+        Raises MessageError for an entry beyond the point-array or with stride 0 and for a camera of another viewport,
+        DeviceError for an OpenGL error.
+        """
+        height, width = self._shape
+        check_viewport(camera, width, height)
+        runs, blocks, batches = self._frame_runs(entries)
+        with self._context:  # another rasterizer of this thread may have made its own current
+            self._runs, self._n_runs = self._write(self._runs, runs, "runs"), len(runs)
+            self._rows.write(self._block_rows(camera, blocks))
+            image = self._draw(camera, entries, blocks, batches)
+            check_errors(self._context, "drawing")
+        return image
+
+    @abstractmethod
+    def _prepare(self) -> None:
+        """Make programs and the framebuffer."""
+
+    @abstractmethod
+    def _block_rows(self, camera: Camera, blocks: np.ndarray) -> np.ndarray:
+        """(k, 3, 4) float32 matrices of (k,) blocks."""
+
+    @abstractmethod
+    def _draw(self, camera: Camera, entries: np.ndarray, blocks: np.ndarray, batches: list[Batch]) -> np.ndarray:
+        """Draw the runs that were sent; the words of the frame."""
+
+    def _upload(self, block_first: np.ndarray, columns: Sequence[np.ndarray], borders: np.ndarray | None) -> None:
+        per_chunk = self._limit // 16 * 4  # whole words of one-byte columns too
+        self._chunk_first = np.arange(0, max(self._n_points, 1), per_chunk)
+        first = np.concatenate([block_first, self._chunk_first, np.empty(0, int) if borders is None else borders])
+        self._segment_first = np.unique(first[first < max(self._n_points, 1)])
+        self._segment_chunk = np.searchsorted(self._chunk_first, self._segment_first, side="right") - 1
+        self._segment_block = np.searchsorted(block_first, self._segment_first, side="right") - 1
+        self._chunks = [
+            [self._buffer(_whole_words(column[first : first + per_chunk])) for column in columns]
+            for first in self._chunk_first
+            if self._n_points
+        ]
+        self._rows = self._buffer(bytes=48 * len(self._block_origin), what="block matrices")
+        self._runs = self._buffer(bytes=RUN.itemsize << 10, what="runs")
+
+    def _buffer(self, data: np.ndarray | None = None, *, bytes: int = 0, what: str = "points") -> moderngl.Buffer:
+        if bytes > self._limit:
+            raise DeviceError(
+                f"{self.device}: found {bytes} bytes of {what}, expected at most {self._limit} (storage-block limit)"
+            )
+        buffer = self._context.buffer(data, reserve=bytes)
+        check_errors(self._context, f"allocating {buffer.size} bytes for {what}")
+        return buffer
+
+    def _write(self, buffer: moderngl.Buffer, data: np.ndarray, what: str) -> moderngl.Buffer:
+        """Fill a buffer, or a larger one in its place if the data needs it."""
+        if data.nbytes > buffer.size:
+            larger = self._buffer(bytes=max(data.nbytes, min(2 * data.nbytes, self._limit)), what=what)
+            buffer.release()
+            buffer = larger
+        buffer.write(data)
+        return buffer
+
+    def _frame_runs(self, entries: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[Batch]]:
+        """(r,) RUN ordered by chunk, (k,) int64 indices of the blocks whose matrices the frame needs, batches.
+
+        Cost: O(entries and the borders they cross), no more for more points.
+        """
+        parts = split_entries(entries, self._segment_first, self._n_points, _MOST_POINTS)
+        if len(self._chunks) > 1:
+            parts = parts[np.argsort(self._segment_chunk[parts["segment"]], kind="stable")]
+        segment = parts["segment"]
+        chunk, block = self._segment_chunk[segment], self._segment_block[segment]
+        drawn = np.zeros(len(self._block_origin), bool)
+        drawn[block] = True
+        runs = np.empty(len(parts), RUN)
+        runs["first"] = parts["first"] - self._chunk_first[chunk]
+        runs["count"], runs["stride"] = parts["count"], parts["stride"]
+        runs["block"] = (np.cumsum(drawn) - 1)[block] | self._marks(segment)
+        end = np.cumsum(-(-parts["count"].astype(np.int64) // self._unit_points))
+        runs["first_unit"][:1], runs["first_unit"][1:] = 0, end[:-1]
+
+        last = np.append(0, end)[np.searchsorted(chunk, np.arange(len(self._chunks)), side="right")]
+        batches = [
+            Batch(i, unit, min(stop - unit, self._batch_units))
+            for i, (begin, stop) in enumerate(zip([0, *last[:-1].tolist()], last.tolist(), strict=False))
+            for unit in range(begin, stop, self._batch_units)
+        ]
+        return runs, np.flatnonzero(drawn), batches
+
+    def _marks(self, segment: np.ndarray) -> np.ndarray | int:
+        """Bits above the place of a run's block, for (r,) segments."""
+        return 0
+
+    def _bind(self, chunk: int) -> None:
+        for binding, buffer in enumerate(self._chunks[chunk]):
+            buffer.bind_to_storage_buffer(binding)
+        self._rows.bind_to_storage_buffer(ROWS)
+        self._runs.bind_to_storage_buffer(RUNS)
+
+    def _dispatch(self, program: moderngl.ComputeShader, batch: Batch) -> None:
+        """Run a program that includes ``runs.glsl``, one invocation a unit of the batch."""
+        program["n_runs"] = self._n_runs
+        program["first_unit"], program["n_units"] = batch.first_unit, batch.n_units
+        program.run(*self._folded(-(-batch.n_units // GROUP_SIZE)))
+
+    def _folded(self, n_groups: int) -> tuple[int, int]:
+        """Columns and rows of a dispatch of at least this many groups: above the limit of one it does nothing."""
+        columns = min(n_groups, self._most_groups)
+        return columns, -(-n_groups // columns)
+
+
+def _whole_words(column: np.ndarray) -> np.ndarray:
+    """A column as 32-bit words; the last bytes of a shorter type are padded."""
+    column = np.ascontiguousarray(column)
+    if column.itemsize == 4:
+        return column
+    words = np.zeros(-(-column.nbytes // 4), np.uint32)
+    words.view(column.dtype)[: len(column)] = column
+    return words
