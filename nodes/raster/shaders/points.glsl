@@ -50,7 +50,8 @@ Square project(uint point, Block block) {
     corner -= 0.5 * (side - 1.0);
 #endif
     corner = floor(corner);
-    bool visible = w >= near && w <= FLOAT_MAX
+    bool kept = (floatBitsToUint(px) & 0x7FFFFFFFu) <= 0x7F800000u;  // no NaN: GLSL promises nothing of comparing one
+    bool visible = kept && w >= near && w <= FLOAT_MAX
         && all(greaterThan(corner + side, vec2(0.0))) && all(lessThan(corner, viewport));
     return Square(visible, ivec2(corner), int(side), floatBitsToUint(w));
 }
