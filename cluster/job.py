@@ -11,7 +11,7 @@ import numpy as np
 
 from ..nodes.culling import CullingNode
 from ..nodes.point_filter import PointFilter
-from ..nodes.raster import PointSize, SplatSettings
+from ..nodes.raster import PointSize, Rasterizer, ResidentPoints, SplatSettings
 from ..nodes.raster.choose import make_rasterizer
 from ..nodes.raster.cpu import kernels_cached
 from ..nodes.render import RenderNode, Wanted, load_points
@@ -55,6 +55,7 @@ class Job:
             splats=self.splats is not None,
             features=self.splats is not None and self.splats.features,
             cells=self.compact or render.point_size_adaptive,
+            spacing=render.point_size_adaptive,
             point_filter=self.point_filter,
         )
         self.background = parse_colour(render.background, "render.background")
@@ -76,26 +77,32 @@ class Job:
         """The sampling node of this run."""
         return SamplingNode(octree, pixel_threshold=self.pixel_threshold)
 
+    def load_points(self, *, verify: bool) -> ResidentPoints:
+        """The points of this run, with what it needs of them. Raises StoreError."""
+        return load_points(self.scene, self.colouring, self.wanted, verify=verify)
+
+    def make_rasterizer(self, points: ResidentPoints) -> Rasterizer:
+        """The rasterizer of this run over ``points``; the caller closes it. Raises DeviceError."""
+        render, camera = self.config.render, self.config.camera
+        return make_rasterizer(
+            render.rasterizer,
+            points,
+            camera.width,
+            camera.height,
+            self.point_size,
+            render.threads or None,
+            splats=self.splats,
+            compact=self.compact,
+        )
+
     @contextmanager
     def open_render(self, progress: Callable[[str, int], None]) -> Iterator[RenderStage]:
         """The render node of this run with its points loaded, its kernels compiled and its output open."""
         progress("loading points", 0)
-        points = load_points(self.scene, self.colouring, self.wanted, verify=self.config.scene.verify)
-        render, output = self.config.render, self.config.output
-        camera = self.config.camera
+        points = self.load_points(verify=self.config.scene.verify)
+        output = self.config.output
         with ExitStack() as stack:
-            rasterizer = stack.enter_context(
-                make_rasterizer(
-                    render.rasterizer,
-                    points,
-                    camera.width,
-                    camera.height,
-                    self.point_size,
-                    render.threads or None,
-                    splats=self.splats,
-                    compact=self.compact,
-                )
-            )
+            rasterizer = stack.enter_context(self.make_rasterizer(points))
             node = RenderNode(rasterizer)
             if rasterizer.name == "cpu" and not kernels_cached():
                 progress("compiling kernels (once; kept for the next run)", 0)

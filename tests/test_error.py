@@ -12,6 +12,7 @@ from build_sources import ArraySource, cells_of, columns_for
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from splatpipe.cluster import cli
+from splatpipe.cluster import job as job_module
 from splatpipe.cluster.error import scene as swept_scene
 from splatpipe.cluster.error import sweep
 from splatpipe.cluster.error.config import ImageSection, load_error_config, sweep_points
@@ -89,14 +90,14 @@ def config(city, tmp_path):
 @pytest.fixture
 def no_gl(monkeypatch):
     """A machine without OpenGL."""
-    real = swept_scene.make_rasterizer
+    real = job_module.make_rasterizer
 
-    def make(name, *rest):
+    def make(name, *rest, **settings):
         if name == "gl":
             raise DeviceError("OpenGL: libEGL.so.1 is missing")
-        return real(name, *rest)
+        return real(name, *rest, **settings)
 
-    monkeypatch.setattr(swept_scene, "make_rasterizer", make)
+    monkeypatch.setattr(job_module, "make_rasterizer", make)
 
 
 def call(*arguments, monkeypatch):
@@ -258,6 +259,11 @@ def test_fixed_point_moves_a_point_by_half_a_bin_at_most(bits):
         assert (np.abs(after) <= np.repeat(half, [400, 1, 599])).all()
     assert moved.colour is points.colour
     assert len(np.unique(moved.x[401:])) <= 2**bits
+
+    x[5] = np.nan  # filtered out: stays so and moves no other
+    filtered = fixed_point(points, edge, bits)
+    assert np.isnan(filtered.x[5])
+    np.testing.assert_array_equal(np.delete(filtered.x, 5), np.delete(moved.x, 5))
 
 
 def test_a_scene_read_back_is_its_input_and_builds_the_same_cells_in_the_other_order(tmp_path):

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ...nodes.point_filter import PointFilter
 from ...nodes.raster import PointSize, ResidentPoints
 from ...nodes.raster.reference import reference_frame
 from ...shared.camera import Camera
@@ -28,19 +29,30 @@ from ...shared.store import Scene
 POINTS_AT_A_TIME = 1 << 18
 """Bounds memory to about 50 MB."""
 
-_VERSION = 1  # of what a kept frame holds
+_VERSION = 2  # of what a kept frame holds
 
 
 class References:
-    """Reference frames of one scene, kept in ``folder`` by what they depend on: points, colours, camera, size."""
+    """Reference frames of one scene, kept in ``folder`` by what they depend on: points, colours, camera, size, filter.
 
-    def __init__(self, folder: Path, scene: Scene, points: ResidentPoints, colouring: Colouring, size: PointSize):
+    points : of that scene, filtered.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        scene: Scene,
+        points: ResidentPoints,
+        colouring: Colouring,
+        size: PointSize,
+        point_filter: PointFilter,
+    ) -> None:
         self._folder = folder
         self._points = points
         self._ranges = leaf_ranges(scene)
         self._size = size
         scene_json = (scene.path / SCENE_FILE).read_bytes()  # holds the checksum of every array
-        self._key = hashlib.sha256(repr((_VERSION, colouring, size)).encode() + scene_json)
+        self._key = hashlib.sha256(repr((_VERSION, colouring, size, point_filter)).encode() + scene_json)
 
     def frame(self, camera: Camera, progress: Callable[[int], object]) -> np.ndarray:
         """(height, width) uint64 framebuffer words; drawn once, then read.

@@ -13,9 +13,8 @@ import numpy as np
 
 from ...nodes.culling import CullingNode
 from ...nodes.raster import ResidentPoints
-from ...nodes.raster.choose import make_rasterizer
 from ...nodes.raster.fixed_point import fixed_point
-from ...nodes.render import RenderNode, load_points
+from ...nodes.render import RenderNode, Wanted, load_points
 from ...nodes.sampling import SamplingNode
 from ...shared.camera import Camera
 from ...shared.messages import RenderPoints, VisibilityBits
@@ -57,7 +56,7 @@ class Pipeline:
 
 @dataclass(frozen=True)
 class _Loaded:
-    """The scene in one point order, in memory."""
+    """The scene in one point order, in memory, with what some of the points of the sweep need of it."""
 
     scene: Scene
     octree: Octree
@@ -76,7 +75,7 @@ class SweptScene:
         self._job = Job(base_config(config, entry, source))
         self._folder = Path(self._job.output)
         self._colouring = self._job.colouring.settled(self._job.scene)
-        self._loaded: dict[str, _Loaded] = {}
+        self._loaded: dict[tuple[str, Wanted], _Loaded] = {}
         info = self._job.scene.info
         self.n_points = info.n_points
         self.radius = math.dist(info.lower, info.upper) / 2
@@ -90,31 +89,33 @@ class SweptScene:
     def prepare(self, progress: FrameProgress) -> None:
         """Load the scene in each order that a point needs; one in the other order is built first."""
         own = self._job.scene
-        for order in {own.info.point_order, *map(self.order_of, self.points)}:
-            path = self._folder / "scenes" / f"{self.name}-{order}.scene"
-            scene = rebuild_in_order(own, order, path, progress.show)
-            points = load_points(scene, self._colouring, verify=self._job.config.scene.verify)
-            self._loaded[order] = _Loaded(scene, scene.octree(), points)
+        needed = {(own.info.point_order, self._job.wanted)}
+        needed |= {(self.order_of(point), Job(point.config).wanted) for point in self.points}
+        scenes: dict[str, Scene] = {}
+        for order, wanted in needed:
+            if order not in scenes:
+                path = self._folder / "scenes" / f"{self.name}-{order}.scene"
+                scenes[order] = rebuild_in_order(own, order, path, progress.show)
+            scene = scenes[order]
+            points = load_points(scene, self._colouring, wanted, verify=self._job.config.scene.verify)
+            self._loaded[order, wanted] = _Loaded(scene, scene.octree(), points)
 
     @contextmanager
     def open(self, point: SweepPoint) -> Iterator[Pipeline]:
         """The nodes of one point. Raises DeviceError where this machine cannot draw it."""
-        job, loaded = Job(point.config), self._loaded[self.order_of(point)]
+        job = Job(point.config)
+        loaded = self._loaded[self.order_of(point), job.wanted]
         points, bits = loaded.points, point.config.positions.bits_per_axis
         if bits:
             points = fixed_point(points, loaded.scene.info.edge, bits)
-        render, camera = point.config.render, point.config.camera
-        with make_rasterizer(
-            render.rasterizer, points, camera.width, camera.height, job.point_size, render.threads or None
-        ) as rasterizer:
+        with job.make_rasterizer(points) as rasterizer:
             yield Pipeline(job.culling_node(loaded.octree), job.sampling_node(loaded.octree), RenderNode(rasterizer))
 
     def references(self, progress: FrameProgress) -> list[np.ndarray]:
         """(height, width) uint64 words of the reference frame of each camera."""
-        loaded = self._loaded[self._job.scene.info.point_order]
-        kept = References(
-            self._folder / "references", loaded.scene, loaded.points, self._colouring, self._job.point_size
-        )
+        loaded = self._loaded[self._job.scene.info.point_order, self._job.wanted]
+        look = self._colouring, self._job.point_size, self._job.point_filter
+        kept = References(self._folder / "references", loaded.scene, loaded.points, *look)
         return [
             kept.frame(camera, lambda done, i=i: progress.show(f"{self.name}: reference {i + 1}", done, self.n_points))
             for i, camera in enumerate(self.cameras)

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from ...nodes.raster.reference import covered_pixels
-from ...nodes.render import load_points
 from ...shared.config import load_config
 from ...shared.messages import HEADER, RENDER_POINT, encode
 from ...shared.octree import Octree
@@ -108,7 +107,7 @@ def _fragments(job: Job, octree: Octree, frame: int) -> int:
     """Pixels that a frame's points cover; the frame is selected again, as the run did."""
     camera = job.camera(frame)
     chosen = job.sampling_node(octree).process(camera, job.culling_node(octree).process(camera))
-    points = load_points(job.scene, job.colouring, verify=False)
+    points = job.load_points(verify=False)
     return covered_pixels(points, camera, chosen.entries, job.point_size)
 
 

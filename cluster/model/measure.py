@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from ...nodes.render import load_points
 from ...shared.config import load_config
 from ...shared.files import write_json
 from ...shared.messages import Kind
@@ -123,7 +122,7 @@ def _machine() -> dict[str, Any]:
 def _render(config: Path, overrides: list[str], rasterizer: str) -> dict[str, Any]:
     """Rates of the rasterizer in use, its share of the machine, and its GPU's parameters where it has one."""
     job = Job(load_config(config, overrides))
-    points = load_points(job.scene, job.colouring, verify=False)
+    points = job.load_points(verify=False)
     camera, threads = job.camera(0), job.config.render.threads or None
     return {
         "vertices_per_s": probes.points_per_s(rasterizer, points, camera, threads)._asdict(),
