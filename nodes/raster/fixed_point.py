@@ -34,10 +34,13 @@ def fixed_point(points: ResidentPoints, root_edge: float, bits: int) -> Resident
 
 
 def block_half_edges(points: ResidentPoints, root_edge: float) -> np.ndarray:
-    """(b,) float64: half the edge of the smallest cube root_edge / 2**k, k ≥ 0, that holds each block's points."""
-    reach = np.maximum(np.abs(points.x), np.abs(points.y))
-    np.maximum(reach, np.abs(points.z), out=reach)
-    largest = np.maximum.reduceat(reach, points.block_first_point).astype(np.float64)
+    """(b,) float64: half the edge of the smallest cube root_edge / 2**k, k ≥ 0, that holds each block's points.
+
+    The NaN of a point that is filtered out takes part in no maximum, and stays NaN in fixed point.
+    """
+    reach = np.fmax(np.abs(points.x), np.abs(points.y))
+    np.fmax(reach, np.abs(points.z), out=reach)
+    largest = np.fmax.reduceat(reach, points.block_first_point).astype(np.float64)
     smallest = np.ldexp(root_edge, -40)  # a block whose points all lie at its origin
     level = np.floor(np.log2(root_edge / 2 / np.maximum(largest, smallest)))
     return np.ldexp(root_edge / 2, -np.maximum(level, 0).astype(np.int32))
