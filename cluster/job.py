@@ -7,28 +7,32 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-import numpy as np
-
 from ..nodes.culling import CullingNode
+from ..nodes.picture.compose import Composer, Picture, PictureSettings
 from ..nodes.point_filter import PointFilter
-from ..nodes.raster import PointSize, Rasterizer, ResidentPoints, SplatSettings
+from ..nodes.raster import MAX_SIDE_PX, PointSize, Rasterizer, ResidentPoints, SplatSettings
 from ..nodes.raster.choose import make_rasterizer
 from ..nodes.raster.cpu import kernels_cached
 from ..nodes.render import RenderNode, Wanted, load_points
 from ..nodes.sampling import SamplingNode
 from ..shared.camera import Camera
-from ..shared.camera_path import camera_path
-from ..shared.colour import Colouring, frame_to_rgba, parse_colour
+from ..shared.colour import Colouring, parse_colour
 from ..shared.config import RunConfig
 from ..shared.errors import ConfigError
 from ..shared.messages import RenderPoints
 from ..shared.octree import Octree
 from ..shared.store import Scene
-from .sink import FrameSink, frame_name
+from ..shared.views import camera_views
+from .sink import FrameSink, layer_name
 
 
 class Job:
-    """What a run needs to know, checked: anything wrong with configuration or scene is raised here (InputError)."""
+    """What a run needs to know, checked: anything wrong with configuration or scene is raised here (InputError).
+
+    Frames are what the pipeline draws, views of pictures: ``n_frames`` of ``views.width`` × ``views.height`` pixels,
+    ``views.per_picture`` to a picture. Sizes of points are in drawn pixels, so that they do not depend on
+    ``render.supersampling`` in the picture.
+    """
 
     def __init__(self, config: RunConfig) -> None:
         if not config.scene.path:
@@ -36,18 +40,17 @@ class Job:
         self.config = config
         self.scene = Scene.open(Path(os.path.normpath(config.scene.path)))
         info = self.scene.info
-        self.n_frames = config.output.frames
+        self.n_pictures = config.output.frames
         self.frames_in_flight = config.pipeline.frames_in_flight
         self.output = Path(os.path.normpath(config.output.directory))
         self.backface = config.culling.backface and "normal" in info.attributes
         self.pixel_threshold = config.sampling.pixel_threshold
         render = config.render
-        self.point_size = PointSize(
-            render.point_size_px, render.point_size_world, render.point_size_max_px, render.point_size_adaptive
+        smallest_px, largest_px = (
+            side * render.supersampling for side in (render.point_size_px, render.point_size_max_px)
         )
-        self.largest_point_px = (
-            render.point_size_max_px if render.point_size_world or render.point_size_adaptive else render.point_size_px
-        )
+        self.point_size = PointSize(smallest_px, render.point_size_world, largest_px, render.point_size_adaptive)
+        self.largest_point_px = largest_px if render.point_size_world or render.point_size_adaptive else smallest_px
         self.splats = SplatSettings(**dict(config.splats)) if render.style == "splats" else None
         self.compact = render.positions == "compact"
         self.point_filter = PointFilter.choose(self.scene, config.filter.classes, config.filter.boxes)
@@ -62,11 +65,20 @@ class Job:
         self.colouring = Colouring.choose(
             self.scene, render.colour, render.colormap, render.colour_range, render.class_colours
         )
-        self._path = camera_path(config.camera, info, self.n_frames)
+        self.views = camera_views(config.camera, info, self.n_pictures, render.supersampling)
+        self.n_frames = self.n_pictures * self.views.per_picture
+        largest_px = render.supersampling * max(config.camera.width, config.camera.height)
+        if largest_px > MAX_SIDE_PX:
+            raise ConfigError(
+                f"render.supersampling = {render.supersampling}: {largest_px} px a side are to be drawn, "
+                f"expected at most {MAX_SIDE_PX}"
+            )
+        if config.output.mp4 and not self.background[3]:
+            raise ConfigError("render.background = 'transparent', expected a colour: a film (output.mp4) has no alpha")
 
     def camera(self, frame: int) -> Camera:
         """The camera of a frame."""
-        return self._path.camera(frame)
+        return self.views.camera(frame)
 
     def culling_node(self, octree: Octree) -> CullingNode:
         """The culling node of this run."""
@@ -74,8 +86,12 @@ class Job:
         return CullingNode(octree, backface=self.backface, margin_px=margin_px, point_filter=self.point_filter)
 
     def sampling_node(self, octree: Octree) -> SamplingNode:
-        """The sampling node of this run."""
-        return SamplingNode(octree, pixel_threshold=self.pixel_threshold)
+        """The sampling node of this run.
+
+        Its threshold is in pixels of the picture; how many points cover a cell is counted in drawn pixels, so that each
+        of those that are averaged has points of its own.
+        """
+        return SamplingNode(octree, pixel_threshold=self.pixel_threshold * self.config.render.supersampling)
 
     def load_points(self, *, verify: bool) -> ResidentPoints:
         """The points of this run, with what it needs of them. Raises StoreError."""
@@ -83,12 +99,12 @@ class Job:
 
     def make_rasterizer(self, points: ResidentPoints) -> Rasterizer:
         """The rasterizer of this run over ``points``; the caller closes it. Raises DeviceError."""
-        render, camera = self.config.render, self.config.camera
+        render = self.config.render
         return make_rasterizer(
             render.rasterizer,
             points,
-            camera.width,
-            camera.height,
+            self.views.width,
+            self.views.height,
             self.point_size,
             render.threads or None,
             splats=self.splats,
@@ -107,10 +123,40 @@ class Job:
             if rasterizer.name == "cpu" and not kernels_cached():
                 progress("compiling kernels (once; kept for the next run)", 0)
             node.warm_up(self.camera(0))
-            sink = None
-            if output.png or output.mp4:
+            composer = sink = None
+            if output.png or output.mp4 or output.depth or output.normals:
+                composer = stack.enter_context(Composer(self.picture_settings))
+                composer.warm_up([self.camera(view) for view in range(self.views.per_picture)])
                 sink = stack.enter_context(FrameSink(self.output, png=output.png, mp4=output.mp4, fps=output.fps))
-            yield RenderStage(node, sink, self.background)
+            yield RenderStage(node, composer, sink, self.views.per_picture)
+
+    @property
+    def picture_settings(self) -> PictureSettings:
+        """What this run makes of its views."""
+        camera, render, output = self.config.camera, self.config.render, self.config.output
+        return PictureSettings(
+            view=camera.view,
+            layout=camera.stereo_layout,
+            width=camera.width,
+            height=camera.height,
+            supersampling=render.supersampling,
+            background=self.background,
+            bits=output.png_bits,
+            edl_strength=render.edl_strength,
+            edl_radius_px=render.edl_radius_px,
+            colours=output.png or output.mp4,
+            depth=output.depth,
+            normals=output.normals,
+            threads=render.threads or len(os.sched_getaffinity(0)),
+        )
+
+    @property
+    def composed_share(self) -> float:
+        """Pixels of a picture over the pixels drawn for it."""
+        camera = self.config.camera
+        panels = 2 if camera.view == "stereo" else 1
+        drawn = self.views.per_picture * self.views.width * self.views.height
+        return panels * camera.width * camera.height / drawn
 
     @property
     def attributes_read(self) -> set[str]:
@@ -126,33 +172,37 @@ class Job:
     def outputs(self) -> list[str]:
         """What the run has written, for people."""
         output, said = self.config.output, []
-        if output.png:
-            last = frame_name(self.n_frames - 1)
-            said.append(f"{self.output / frame_name(0)} … {last}" if self.n_frames > 1 else str(self.output / last))
+        for layer in [name for name in ("png", "depth", "normals") if getattr(output, name)]:
+            last = layer_name(layer, self.n_pictures - 1)
+            first = str(self.output / layer_name(layer, 0))
+            said.append(f"{first} … {last}" if self.n_pictures > 1 else first)
         if output.mp4:
             said.append(str(self.output / "film.mp4"))
         return [*said, str(self.output / "run.json")]
 
 
 class RenderStage:
-    """Render node and output of one run."""
+    """Render node, composition and output of one run."""
 
-    def __init__(self, node: RenderNode, sink: FrameSink | None, background: np.ndarray) -> None:
+    def __init__(self, node: RenderNode, composer: Composer | None, sink: FrameSink | None, per_picture: int) -> None:
         self._node = node
+        self._composer = composer
         self._sink = sink
-        self._background = background
+        self._per_picture = per_picture
         self.description = node.description
 
-    def draw(self, camera: Camera, chosen: RenderPoints) -> np.ndarray | None:
-        """The picture, (height, width, 4) uint8; None where nobody wants it (the frame is drawn all the same)."""
+    def draw(self, camera: Camera, chosen: RenderPoints) -> Picture | None:
+        """Draw a frame; the picture that it completes, None before its last view or where nobody wants it."""
         words = self._node.process(camera, chosen)
-        return frame_to_rgba(words, self._background) if self._sink is not None else None
+        if self._composer is None:
+            return None
+        return self._composer.add(camera.frame % self._per_picture, camera, words)
 
-    def show(self, frame: int, picture: np.ndarray | None) -> None:
+    def show(self, frame: int, picture: Picture | None) -> None:
         """Hand the picture to the output; waits while that is behind."""
         if self._sink is not None and picture is not None:
-            self._sink.put(frame, picture)
+            self._sink.put(frame // self._per_picture, picture)
 
     def times(self) -> dict[str, list[float]]:
-        """Seconds of encoding, frame by frame, by kind of output; complete once the output is closed."""
+        """Seconds of encoding, picture by picture, by kind of output; complete once the output is closed."""
         return self._sink.times if self._sink is not None else {}

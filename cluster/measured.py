@@ -20,7 +20,8 @@ def measured_run(config: Path, overrides: list[str], *, keep: Path | None = None
     """
     with tempfile.TemporaryDirectory() as folder:
         out = keep or Path(folder) / "out"
-        sets = ["output.png=false", "output.mp4=false", *overrides, f"output.directory={out}"]
+        nothing = [f"output.{kind}=false" for kind in ("png", "mp4", "depth", "normals")]
+        sets = [*nothing, *overrides, f"output.directory={out}"]
         command = [sys.executable, "-m", "splatpipe.cluster", "run", str(config)]
         command += [part for item in sets for part in ("--set", item)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)

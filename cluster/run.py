@@ -38,7 +38,7 @@ def run_command(config_path: Path, overrides: list[str], json_path: Path | None)
         raise ConfigError("pipeline.topology = 'pipelined': MPI is missing; install splatpipe[mpi] or choose 'single'")
     job = Job(config)  # everything that can be wrong with the input is said here, before anything starts
     prepare_output(job.output)
-    with FrameProgress(config.output.frames) as progress:
+    with FrameProgress(job.n_frames) as progress:
         progress.show("planning", 0)
         decision = decide(job)
         if decision.topology == "single":
@@ -151,7 +151,6 @@ def _finish(
     job: Job, decision: Decision, result: dict[str, Any], config_path: Path, json_path: Path | None
 ) -> dict[str, Any]:
     """Write ``run.json`` (last, so that a killed run leaves none); what it holds, less the per-frame lists."""
-    n_frames = job.n_frames
     content = {
         "record_version": RECORD_VERSION,
         "topology": decision.topology,
@@ -161,8 +160,9 @@ def _finish(
         "config": job.config.model_dump(mode="json"),
         "scene": {"points": job.scene.info.n_points, "cells": job.scene.info.n_cells},
         "colour": job.colouring.mode,
-        "frames": n_frames,
-        "frames_per_s": n_frames / result["rendered_s"],
+        "frames": job.n_pictures,
+        "views_per_picture": job.views.per_picture,
+        "frames_per_s": job.n_pictures / result["rendered_s"],
         "seconds": result["finished_s"],
         **{key: result[key] for key in result if key not in ("rendered_s", "finished_s")},
         "output": job.outputs(),

@@ -1,4 +1,7 @@
-"""Where frames go: PNG files and a film, encoded beside the rendering, written whole or not at all."""
+"""Where pictures go: PNG and TIFF files and a film, encoded beside the rendering, written whole or not at all.
+
+A layer of a picture is a file of its own: ``png`` (colours), ``depth`` and ``normals``.
+"""
 
 from __future__ import annotations
 
@@ -13,48 +16,59 @@ from typing import Any
 
 import numpy as np
 
+from ..nodes.picture.compose import Picture
 from ..shared.errors import DeviceError
 from ..shared.files import disk_error, write_whole
 
 PNG_LEVEL = 1  # files 10 % larger than level 6 and five times as fast: the encoder must not be the slowest stage
 
 
-class FrameSink:
-    """Takes (height, width, 4) uint8 frames in order; a context manager that ends with every file whole.
+LAYERS = {"png": ("frame", "png"), "depth": ("depth", "tiff"), "normals": ("normal", "png")}
+"""Layer → prefix and suffix of its files."""
 
-    ``put`` waits while more than ``backlog`` frames are unencoded, which bounds memory. An error in an encoder is
-    raised by the next ``put`` or at the end. A frame's file is written under another name and renamed; the film gets
-    its name at the end.
+
+class FrameSink:
+    """Takes pictures in order; a context manager that ends with every file whole.
+
+    png : write the colours of each, with as many bits as they have.  mp4 : make a film of them, 8 bits.
+    Depths and normals are written where a picture has them.
+
+    ``put`` waits while more than ``backlog`` files are unencoded, which bounds memory. An error in an encoder is
+    raised by the next ``put`` or at the end. A file is written under another name and renamed; the film gets its name
+    at the end.
     """
 
     def __init__(self, directory: Path, *, png: bool, mp4: bool, fps: float, workers: int = 2, backlog: int = 8):
         self.directory = directory
         self._png = png
-        self._pool = ThreadPoolExecutor(workers, "png") if png else None
+        self._pool = ThreadPoolExecutor(workers, "encode")
         self._room = threading.BoundedSemaphore(backlog)
         self._pending: list[Future[None]] = []
         self._film = _Film(directory / "film.mp4", fps) if mp4 else None
         self.times: dict[str, list[float]] = {}
-        if png:
-            self.times["png_s"] = []
         if self._film is not None:
             self.times["mp4_s"] = self._film.times
 
-    def put(self, frame: int, rgba: np.ndarray) -> None:
-        """Queue a frame. Raises what an encoder of an earlier frame ran into."""
+    def put(self, number: int, picture: Picture) -> None:
+        """Queue a picture. Raises what an encoder of an earlier one ran into."""
         self._raise_failed()
-        if self._film is not None:
-            self._film.put(rgba)
-        if self._pool is not None:
-            self._room.acquire()
-            self._pending.append(self._pool.submit(self._write_png, frame, rgba))
+        if self._film is not None and picture.rgba is not None:
+            self._film.put(picture.rgba)
+        for layer, image in (
+            ("png", picture.rgba if self._png else None),
+            ("depth", picture.depth),
+            ("normals", picture.normals),
+        ):
+            if image is not None:
+                times = self.times.setdefault(f"{layer}_s", [])
+                self._room.acquire()
+                self._pending.append(self._pool.submit(self._write, layer_name(layer, number), image, times))
 
     def __enter__(self) -> FrameSink:
         return self
 
     def __exit__(self, kind: object, error: object, trace: object) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(wait=True, cancel_futures=error is not None)
+        self._pool.shutdown(wait=True, cancel_futures=error is not None)
         if self._film is not None:
             self._film.close(keep=error is None)
         if error is None:
@@ -64,18 +78,40 @@ class FrameSink:
         while self._pending and self._pending[0].done():
             self._pending.pop(0).result()
 
-    def _write_png(self, frame: int, rgba: np.ndarray) -> None:
+    def _write(self, name: str, image: np.ndarray, times: list[float]) -> None:
         started = time.perf_counter()
         try:
-            from PIL import Image
-
-            path = self.directory / frame_name(frame)
-            opaque = bool((rgba[..., 3] == 255).all())
-            image = Image.fromarray(rgba[..., :3] if opaque else rgba)
-            write_whole(path, lambda part: image.save(part, format="PNG", compress_level=PNG_LEVEL))
-            self.times["png_s"].append(time.perf_counter() - started)
+            write = {"float32": _write_tiff, "uint8": _write_png, "uint16": _write_png_16}[image.dtype.name]
+            write_whole(self.directory / name, lambda part: write(part, image))
+            times.append(time.perf_counter() - started)
         finally:
             self._room.release()
+
+
+def _write_png(path: Path, rgba: np.ndarray) -> None:
+    from PIL import Image
+
+    opaque = bool((rgba[..., 3] == 255).all())
+    Image.fromarray(rgba[..., :3] if opaque else rgba).save(path, format="PNG", compress_level=PNG_LEVEL)
+
+
+def _write_png_16(path: Path, rgba: np.ndarray) -> None:
+    """With pypng: Pillow has no images of three or four channels of 16 bits."""
+    import png
+
+    height, width = rgba.shape[:2]
+    opaque = bool((rgba[..., 3] == 65535).all())
+    rows = np.ascontiguousarray(rgba[..., :3] if opaque else rgba, ">u2").reshape(height, -1)
+    greyscale: Any = False  # declared as something else, and true if left out
+    writer = png.Writer(width, height, greyscale=greyscale, alpha=not opaque, bitdepth=16, compression=PNG_LEVEL)
+    with path.open("wb") as file:
+        writer.write_packed(file, (row.tobytes() for row in rows))
+
+
+def _write_tiff(path: Path, depth: np.ndarray) -> None:
+    from PIL import Image
+
+    Image.fromarray(depth).save(path, format="TIFF")
 
 
 class _Film:
@@ -129,7 +165,8 @@ class _Film:
                     stream = container.add_stream("libx264", rate=self._rate)
                     stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
                     stream.options = {"preset": "veryfast", "crf": "20"}
-                rgb = np.ascontiguousarray(rgba[:height, :width, :3])
+                rgb = rgba[:height, :width, :3]
+                rgb = np.ascontiguousarray(rgb if rgb.dtype == np.uint8 else rgb >> 8, np.uint8)
                 for packet in stream.encode(self._av.VideoFrame.from_ndarray(rgb, format="rgb24")):
                     container.mux(packet)
                 self.times.append(time.perf_counter() - started)
@@ -138,9 +175,10 @@ class _Film:
                     container.mux(packet)
 
 
-def frame_name(frame: int) -> str:
-    """File name of a frame's picture."""
-    return f"frame_{frame:04d}.png"
+def layer_name(layer: str, number: int) -> str:
+    """File name of a layer of a picture."""
+    prefix, suffix = LAYERS[layer]
+    return f"{prefix}_{number:04d}.{suffix}"
 
 
 def prepare_output(directory: Path) -> None:
@@ -151,7 +189,9 @@ def prepare_output(directory: Path) -> None:
     try:
         directory.mkdir(parents=True, exist_ok=True)
         write_whole(directory / "run.json", lambda part: part.write_bytes(b""))  # is it writable?
-        for old in [*directory.glob("frame_*.png"), *directory.glob(".*.part"), directory / "film.mp4"]:
+        layers = [f"{prefix}_*.{suffix}" for prefix, suffix in LAYERS.values()]
+        left = [path for pattern in [*layers, ".*.part"] for path in directory.glob(pattern)]
+        for old in [*left, directory / "film.mp4"]:
             old.unlink(missing_ok=True)
         (directory / "run.json").unlink()
     except OSError as error:

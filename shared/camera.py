@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -41,6 +41,19 @@ class Camera:
         x = (c[0] + c[3]) * (self.width / 2)
         y = (c[3] - c[1]) * (self.height / 2)
         return np.stack([x, y, c[3]])
+
+    @property
+    def pinhole_px(self) -> tuple[float, float, float, float]:
+        """(fx, fy, cx, cy): a point at x right, y up and depth d of the eye is at (cx + fx·x/d, cy − fy·y/d) px."""
+        x, y, axis = self.pixel_from_world[:, :3]
+        cx, cy = float(x @ axis), float(y @ axis)
+        return float(np.linalg.norm(x - cx * axis)), float(np.linalg.norm(y - cy * axis)), cx, cy
+
+    def shifted(self, half_widths: float) -> Camera:
+        """The same camera with its image moved to the right: an off-axis frustum, its near plane unturned."""
+        clip = self.clip_from_world.copy()
+        clip[0] += half_widths * clip[3]
+        return replace(self, clip_from_world=clip)
 
 
 def perspective_camera(

@@ -43,20 +43,32 @@ class Path(Protocol):
         """Vertical field of view at a time in [0, 1]."""
         ...
 
+    def target_distance(self, time: float) -> float:
+        """How far away is what the camera looks at, world units, > 0; at a time in [0, 1]."""
+        ...
+
 
 @dataclass(frozen=True)
 class CameraPath:
-    """The cameras of a film of ``n_frames`` frames; width and height in pixels, near in world units."""
+    """The cameras of a film of ``n_frames`` frames; width and height in pixels, near in world units.
+
+    up : (3,) float64 unit axis, what is up in the scene.
+    """
 
     path: Path
     n_frames: int
     width: int
     height: int
     near: float
+    up: np.ndarray
+
+    def time(self, frame: int) -> float:
+        """The time in [0, 1] of a frame in [0, n_frames)."""
+        return frame / (self.n_frames if self.path.is_closed else max(self.n_frames - 1, 1))
 
     def camera(self, frame: int) -> Camera:
         """The camera of a frame in [0, n_frames)."""
-        time = frame / (self.n_frames if self.path.is_closed else max(self.n_frames - 1, 1))
+        time = self.time(frame)
         return perspective_camera(
             frame=frame,
             world_from_camera=self.path.pose(time),
@@ -75,6 +87,7 @@ def camera_path(settings: CameraSection, scene: SceneInfo, n_frames: int) -> Cam
     lower, upper = np.array(scene.lower), np.array(scene.upper)
     up = up_vector(scene) if settings.up == "scene" else axis_vector(settings.up)
     fov_rad = math.radians(settings.fov_deg)
+    scene_radius = float(np.linalg.norm(upper - lower)) / 2 or 1.0
     match settings.path:
         case "orbit":
             center = (lower + upper) / 2 if settings.center is None else np.array(settings.center)
@@ -97,9 +110,9 @@ def camera_path(settings: CameraSection, scene: SceneInfo, n_frames: int) -> Cam
             ]
             path = KeyframePath(tuple(keys), up)
         case "poses":
-            path = PosesPath.checked(settings.poses, fov_rad, n_frames)
-    near = settings.near or NEAR_SHARE * (float(np.linalg.norm(upper - lower)) / 2 or 1.0)
-    return CameraPath(path, n_frames, settings.width, settings.height, near)
+            path = PosesPath.checked(settings.poses, fov_rad, n_frames, (lower + upper) / 2, scene_radius)
+    near = settings.near or NEAR_SHARE * scene_radius
+    return CameraPath(path, n_frames, settings.width, settings.height, near, up)
 
 
 def axis_vector(name: str) -> np.ndarray:
@@ -152,6 +165,10 @@ class OrbitPath:
         """Constant."""
         return self.fov_rad
 
+    def target_distance(self, time: float) -> float:
+        """That of the centre."""
+        return self.radius
+
     def pose(self, time: float) -> np.ndarray:
         """(4, 4) float64 world_from_camera."""
         azimuth = self.start_rad + time * self.sweep_rad
@@ -194,14 +211,27 @@ def orbit_radius(
 
 @dataclass(frozen=True)
 class PosesPath:
-    """One given pose a frame: world_from_camera, (n, 4, 4) or (n, 3, 4) float64."""
+    """One given pose a frame: world_from_camera, (n, 4, 4) or (n, 3, 4) float64.
+
+    scene_middle : (3,) float64, world; stands for the target, which a pose does not have.
+    scene_radius : world units, > 0.
+    """
 
     world_from_camera: np.ndarray
     fov_rad: float
+    scene_middle: np.ndarray
+    scene_radius: float
     is_closed: bool = False
 
     @classmethod
-    def checked(cls, matrices: list[list[list[float]]], fov_rad: float, n_frames: int) -> PosesPath:
+    def checked(
+        cls,
+        matrices: list[list[list[float]]],
+        fov_rad: float,
+        n_frames: int,
+        scene_middle: np.ndarray,
+        scene_radius: float,
+    ) -> PosesPath:
         """Raises ConfigError unless there is one 4×4 or 3×4 matrix a frame."""
         if len(matrices) != n_frames:
             raise ConfigError(f"camera.poses: found {len(matrices)}, expected {n_frames}, one a frame (output.frames)")
@@ -210,11 +240,17 @@ class PosesPath:
                 raise ConfigError(
                     f"camera.poses[{i}]: found {[len(row) for row in matrix]} numbers, expected 4×4 or 3×4"
                 )
-        return cls(np.array([matrix[:3] for matrix in matrices], np.float64), fov_rad)
+        poses = np.array([matrix[:3] for matrix in matrices], np.float64)
+        return cls(poses, fov_rad, scene_middle, scene_radius)
 
     def fov_y_rad(self, time: float) -> float:
         """Constant."""
         return self.fov_rad
+
+    def target_distance(self, time: float) -> float:
+        """Depth of the scene's middle, but not less than a tenth of the scene's radius."""
+        pose = self.pose(time)
+        return max(float((self.scene_middle - pose[:3, 3]) @ -pose[:3, 2]), self.scene_radius / 10)
 
     def pose(self, time: float) -> np.ndarray:
         """The pose of the frame nearest to a time."""

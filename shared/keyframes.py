@@ -79,6 +79,10 @@ class KeyframePath:
         """Interpolated in the logarithm of the focal length: a zoom at an even rate, never out of (0, π)."""
         return 2 * math.atan(math.exp(self._log_tan.at(time)[0]))
 
+    def target_distance(self, time: float) -> float:
+        """From eye to target, but not less than a hundredth of what the keys have: their ways may cross."""
+        return max(float(np.linalg.norm(self._target.at(time) - self._eye.at(time))), float(self._lengths.min()) / 100)
+
     @cached_property
     def _eye(self) -> _Hermite:
         return self._curve([key.eye for key in self.keys])

@@ -35,7 +35,7 @@ def instrumented_run(config: Path, overrides: list[str]) -> tuple[dict[str, Any]
     overrides = [
         *overrides,
         f"pipeline.topology={decide(job).topology}",
-        f"output.frames={min(job.n_frames, FRAMES)}",
+        f"output.frames={min(job.n_pictures, FRAMES)}",
     ]
     return measured_run(config, overrides), overrides
 
@@ -53,7 +53,7 @@ def measured_application(
     gpu = run["rasterizer"].startswith("gl")
     entries_bytes = max(per_frame["entries"]) * RENDER_POINT.itemsize
     bits_bytes = (len(octree) + 7) // 8
-    framebuffer_bytes = job.config.camera.width * job.config.camera.height * _WORD_BYTES
+    framebuffer_bytes = job.views.width * job.views.height * _WORD_BYTES
     n_points = max(per_frame["points"])
     cpu_bytes = {
         "culling": _octree_bytes(octree) + bits_bytes,

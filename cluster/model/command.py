@@ -8,6 +8,7 @@ from typing import Any
 
 from ...shared.config import load_config
 from ...shared.errors import InputError
+from ...shared.views import VIEWS_PER_PICTURE
 from ..launch import inside_mpi
 from ..progress import FrameProgress
 from .application import instrumented_run, measured_application
@@ -45,7 +46,8 @@ def make_model(
 
     config : what to run; None takes the application from the system file as well.
     system_path : a system file in place of this cluster.  save_path : where to write the parameters.
-    frames_per_s : the rate to hold the conditions against; None for that of the configuration (``output.fps``) or file.
+    frames_per_s : the rate to hold the conditions against, views counted one by one; None for that of the configuration
+        (``output.fps``) or file.
     Raises InputError for bad input before anything is measured.
     """
     if inside_mpi():
@@ -56,7 +58,8 @@ def make_model(
     run: dict[str, Any] = {}
     samples: dict[str, Any] = {}
     if config is not None:
-        wanted = frames_per_s or load_config(config, overrides).output.fps
+        settings = load_config(config, overrides)
+        wanted = frames_per_s or settings.output.fps * VIEWS_PER_PICTURE[settings.camera.view]
         run, samples, system, application = _measure(config, overrides, filed, system_path, wanted)
     elif filed is None:
         raise InputError("found neither CONFIG nor --system FILE, expected one of them or both")

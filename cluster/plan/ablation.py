@@ -18,12 +18,12 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from ...nodes.culling import CullingNode
+from ...nodes.picture.compose import Composer
 from ...nodes.raster import PointSize, Rasterizer, ResidentPoints
 from ...nodes.raster.choose import make_rasterizer
 from ...nodes.render import load_points
 from ...nodes.sampling import SamplingNode
 from ...shared.camera import Camera
-from ...shared.colour import frame_to_rgba
 from ..job import Job
 from ..record import spread_ms
 from ..sink import FrameSink
@@ -205,11 +205,14 @@ def _png(bench: _Bench) -> Trial | None:
     if bench.job.config.output.png:
         return None
     folder = Path(bench.stack.enter_context(TemporaryDirectory()))
+    composer = bench.stack.enter_context(Composer(replace(bench.job.picture_settings, colours=True)))
 
     def encode(camera: Camera) -> np.ndarray:
         words = bench.draw(camera)
-        with FrameSink(folder, png=True, mp4=False, fps=1.0) as sink:
-            sink.put(camera.frame, frame_to_rgba(words, bench.job.background))
+        picture = composer.add(camera.frame % bench.job.views.per_picture, camera, words)
+        if picture is not None:
+            with FrameSink(folder, png=True, mp4=False, fps=1.0) as sink:
+                sink.put(camera.frame, picture)
         return words
 
     return Trial(PNG, bench.draw, encode)

@@ -104,6 +104,7 @@ class Decision:
 def estimate(job: Job, work: Workload, cores: int, costs: UnitCosts = COSTS) -> Estimate:
     """What an average frame takes on one rank and on three that share ``cores``."""
     output = job.config.output
+    composed = work.pixels * job.composed_share
     shown = output.png or output.mp4
     alone_s = costs.entry_s * work.entries + costs.picture_s * work.pixels * shown  # on one core, others wait
     if resolve_rasterizer(job.config.render.rasterizer) == "cpu":
@@ -114,7 +115,7 @@ def estimate(job: Job, work: Workload, cores: int, costs: UnitCosts = COSTS) -> 
     else:
         render_core_s = 0.0
         render_s = costs.gl_point_s * work.points + alone_s
-    encode_s = (costs.png_s * output.png + costs.mp4_s * output.mp4) * work.pixels
+    encode_s = (costs.png_s * output.png + costs.mp4_s * output.mp4) * composed
     busy_s = work.culling_s + work.sampling_s + render_core_s + alone_s + encode_s
     stages = work.culling_s, work.sampling_s, render_s
     single_s = max(sum(stages), busy_s / cores)

@@ -22,7 +22,7 @@ class Workload:
     """Counts and seconds of an average frame.
 
     cells : of the octree.  cells_visible, entries, points : what culling lets through, what sampling asks for.
-    pixels : of the picture.  culling_s, sampling_s : measured on this machine.
+    pixels : drawn.  culling_s, sampling_s : measured on this machine.
     render_s : measured where a run has drawn, else None.
     """
 
@@ -75,4 +75,4 @@ def _least(work: Callable[[], T]) -> tuple[float, T]:
 
 
 def _pixels(job: Job) -> int:
-    return job.config.camera.width * job.config.camera.height
+    return job.views.width * job.views.height

@@ -66,7 +66,7 @@ def calibration_experiment(base: Path, overrides: list[str], output: Path, repea
     run = load_config(base, overrides)
     whole: dict[str, Any] = run.model_dump(mode="json", exclude_none=True)
     common = {f"{section}.{key}": value for section, table in whole.items() for key, value in table.items()}
-    for key in ("output.directory", "output.png", "output.mp4"):
+    for key in ("output.directory", "output.png", "output.mp4", "output.depth", "output.normals"):
         del common[key]
     common["scene.path"] = os.path.abspath(run.scene.path)
     points = calibration_points(run)

@@ -23,6 +23,7 @@ import numpy as np
 from ...nodes.raster.cpu import MERGED_PIXELS_PER_POINT
 from ...shared.config import RunConfig
 from ...shared.errors import InputError
+from ...shared.views import VIEWS_PER_PICTURE
 from .workload import Workload, threads_of
 
 CONTENTIONS = np.linspace(0, 1.5, 151)
@@ -91,9 +92,15 @@ class Measured:
         return threads_of(self.config.render.threads)
 
     @property
+    def frames_per_s(self) -> list[float]:
+        """Rate of the whole run, of each repeat. Records count pictures; frames are their views."""
+        views = VIEWS_PER_PICTURE[self.config.camera.view]
+        return [record["frames_per_s"] * views for record in self.records]
+
+    @property
     def frame_s(self) -> float:
         """Seconds a frame of the whole run: median over the repeats."""
-        return float(np.median([1 / record["frames_per_s"] for record in self.records]))
+        return float(np.median([1 / rate for rate in self.frames_per_s]))
 
     def stage_s(self, stage: str) -> np.ndarray:
         """(n_frames,) seconds of work of each frame: median over the repeats, so that what disturbed one is not in."""

@@ -44,8 +44,7 @@ def compare(
     for i, run in measured.items():
         if i < n_points:
             setting = Setting(run.topology, run.threads, run.config.pipeline.frames_in_flight)
-            rates = [record["frames_per_s"] for record in run.records]
-            out.append(Comparison(experiment.points[i], rates, forecast(costs, run.load, setting, machine)))
+            out.append(Comparison(experiment.points[i], run.frames_per_s, forecast(costs, run.load, setting, machine)))
     return out, costs
 
 

@@ -26,13 +26,13 @@ SAMPLED_POINTS = 4096
 
 @dataclass(frozen=True)
 class Workload:
-    """Counts of one run. Arrays are (n_frames,) float64.
+    """Counts of one run. Arrays are (n_frames,) float64; a frame is a view of a picture.
 
     cells : of the octree.
     cells_visible, entries, points : a frame's bits set, render-points entries, points drawn.
     cold : of the points, those among the first ``COLD_POINTS`` of an entry.
     covered : pixels that the frame's points write, each as often as it is written.
-    pixels : of the picture.
+    pixels : drawn a frame.
     visibility_bytes, render_points_bytes : message sizes, header included.
     """
 
@@ -81,7 +81,7 @@ def count_workload(job: Job) -> Workload:
         covered[frame] = chosen.n_points * _pixels_per_point(job, camera, chosen)
         head, payload = encode(chosen)
         sizes[frame] = len(head) + len(payload)
-    pixels = job.config.camera.width * job.config.camera.height
+    pixels = job.views.width * job.views.height
     bits_bytes = HEADER.size + (len(octree) + 7) // 8
     return Workload(len(octree), pixels, visible, entries, points, cold, covered, bits_bytes, sizes)
 
