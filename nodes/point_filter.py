@@ -11,7 +11,7 @@ the bits of x, which no arithmetic touches.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal, Protocol
 
@@ -19,8 +19,9 @@ import numpy as np
 from numba import njit
 
 from ..shared.errors import ConfigError
-from ..shared.octree import Octree
+from ..shared.octree import FEATURES, Octree
 from ..shared.store import Scene
+from .raster import CellFeatures
 
 Corner = tuple[float, float, float]
 
@@ -113,6 +114,15 @@ class PointFilter:
         x, y, z, codes = map(_read_only, (x, y, z, codes))
         _filter(x, y, z, codes, keep_class, first, ends, origin, corners, keep_inside, out)
         return out
+
+
+def features_left(features: CellFeatures, x: np.ndarray) -> CellFeatures:
+    """The same but for cells that lost a point, which become cells of no feature: a quad would show what was cut away.
+
+    x : (n,) float32, filtered.  Cost: one pass over x; memory 1 byte a point while working.
+    """
+    lost = np.logical_or.reduceat(np.isnan(x), features.first_point)
+    return replace(features, feature=np.where(lost, np.uint8(FEATURES.index("none")), features.feature))
 
 
 def _read_only(column: np.ndarray) -> np.ndarray:

@@ -9,8 +9,8 @@ from helpers_octree import leaf_of_points, scenes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from splatpipe.nodes.culling import CullingNode, padded_half_edges
-from splatpipe.nodes.point_filter import ClipBox, PointFilter
-from splatpipe.nodes.raster import PointSize
+from splatpipe.nodes.point_filter import ClipBox, PointFilter, features_left
+from splatpipe.nodes.raster import CellFeatures, PointSize
 from splatpipe.nodes.raster.choose import make_rasterizer
 from splatpipe.nodes.raster.gl_context import gl_available
 from splatpipe.nodes.render import RenderNode, Wanted, load_points
@@ -224,3 +224,13 @@ def test_what_makes_no_sense_is_refused(make_scene, tmp_path):
     build_scene([ArraySource(np.eye(3))], tmp_path / "bare.scene")
     with pytest.raises(ConfigError, match=r"filter\.classes = \[2\]: the scene has no attribute, expected classific"):
         PointFilter.choose(Scene.open(tmp_path / "bare.scene"), [2], [])
+
+
+def test_a_cell_that_lost_a_point_is_no_flat_cell():
+    x = np.zeros(10, np.float32)
+    x[[4, 9]] = np.nan
+    first, n = np.array([0, 3, 5, 8]), np.array([3, 2, 3, 2])
+    quads = np.zeros((4, 3)), np.zeros((4, 2, 3), np.float32)
+    left = features_left(CellFeatures(first, n, np.array([1, 1, 2, 3], np.uint8), *quads), x)
+    assert left.feature.tolist() == [1, 0, 2, 0]
+    assert left.feature.dtype == np.uint8
