@@ -30,7 +30,7 @@ _BATCH_PIECES = 1 << 20
 
 _ATOMIC_INT64 = ("GL_ARB_gpu_shader_int64", "GL_NV_shader_atomic_int64")
 
-_PIECES, _FRAMEBUFFER, _COMMANDS, _SIDES = 6, 7, 7, 8  # bindings, as in the shaders
+_PIECES, _FRAMEBUFFER, _COMMANDS, _SIDES = 8, 9, 10, 11  # bindings, as in the shaders
 
 
 class _GlPointRasterizer(GlResident):

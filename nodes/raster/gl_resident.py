@@ -22,8 +22,8 @@ from .pieces import split_entries
 if TYPE_CHECKING:
     import moderngl
 
-ROWS, RUNS = 4, 5
-"""Bindings behind x, y, z and colour, as in ``columns.glsl`` and ``runs.glsl``."""
+ROWS, RUNS = 6, 7
+"""Bindings behind those of the columns, as in ``columns.glsl`` and ``runs.glsl``."""
 
 GROUP_SIZE = 64
 """Invocations of a workgroup, as in the shaders."""
@@ -149,7 +149,7 @@ class GlResident(ABC):
             if self._n_points
         ]
         self._rows = self._buffer(bytes=48 * len(self._block_origin), what="block matrices")
-        self._runs = self._buffer(bytes=RUN.itemsize << 10, what="runs")
+        self._runs = self._buffer(bytes=RUN.itemsize << 6, what="runs")
 
     def _buffer(self, data: np.ndarray | None = None, *, bytes: int = 0, what: str = "points") -> moderngl.Buffer:
         if bytes > self._limit:

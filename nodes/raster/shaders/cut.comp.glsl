@@ -1,10 +1,10 @@
 // Runs → pieces of at most piece_points points, even work for workgroups; one invocation a piece.
 // COMMANDS: also one indirect draw a piece, whose base instance fetches the piece.
 
-layout(std430, binding = 6) restrict writeonly buffer Pieces { uvec4 pieces[]; };  // first, count, stride, block
+layout(std430, binding = 8) restrict writeonly buffer Pieces { uvec4 pieces[]; };  // first, count, stride, block
 #ifdef COMMANDS
 struct Command { uint count, instances, first_vertex, base_instance, padding; };  // the binding steps 20 bytes
-layout(std430, binding = 7) restrict writeonly buffer Commands { Command commands[]; };
+layout(std430, binding = 10) restrict writeonly buffer Commands { Command commands[]; };
 #endif
 uniform uint piece_points;
 

@@ -1,12 +1,14 @@
 // The projection of a point; goes behind columns.glsl.
 // SQUARES: points cover more than one pixel.  ADAPTIVE: each block has a side of its own.
 
+const float FLOAT_MAX = 3.4028234e38;
+
 uniform vec2 viewport;  // pixels
 uniform float near;
 #ifdef SQUARES
 uniform vec2 side_range_px;  // least, largest
 #ifdef ADAPTIVE
-layout(std430, binding = 8) restrict readonly buffer Sides { float world_px[]; };
+layout(std430, binding = 11) restrict readonly buffer Sides { float world_px[]; };
 #else
 uniform float world_px;  // side in world units × focal length in pixels; 0: fixed side
 #endif

@@ -9,7 +9,7 @@ struct Run {
     uint block;       // place of its matrix
     uint first_unit;  // units of the runs before
 };
-layout(std430, binding = 5) restrict readonly buffer Runs { Run runs[]; };
+layout(std430, binding = 7) restrict readonly buffer Runs { Run runs[]; };
 uniform uint n_runs;
 uniform uint first_unit;  // of this batch
 uniform uint n_units;

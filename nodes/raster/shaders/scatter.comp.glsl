@@ -4,18 +4,18 @@
 
 layout(local_size_x = 64) in;
 
-layout(std430, binding = 6) restrict readonly buffer Pieces { uvec4 pieces[]; };  // first, count, stride, block
+layout(std430, binding = 8) restrict readonly buffer Pieces { uvec4 pieces[]; };  // first, count, stride, block
 uniform uint n_pieces;
 
 // Reading before the atomic loses nothing: words only fall, so an old value costs at most a needless atomic.
 #ifdef PASS_WORD
-layout(std430, binding = 7) restrict buffer Framebuffer { uint64_t words[]; };
+layout(std430, binding = 9) restrict buffer Framebuffer { uint64_t words[]; };
 void cover(int pixel, uint depth, uint point) {
     if (depth <= uint(words[pixel] >> 32))
         atomicMin(words[pixel], uint64_t(depth) << 32 | uint64_t(colour[point]));
 }
 #else
-layout(std430, binding = 7) restrict buffer Framebuffer { uvec2 words[]; };  // colour, depth bits
+layout(std430, binding = 9) restrict buffer Framebuffer { uvec2 words[]; };  // colour, depth bits
 void cover(int pixel, uint depth, uint point) {
 #ifdef PASS_DEPTH
     if (depth < words[pixel].y) atomicMin(words[pixel].y, depth);

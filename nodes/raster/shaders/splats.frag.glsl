@@ -1,0 +1,40 @@
+// A fragment of a splat. PASS_VISIBILITY: its depth, the least of which stays by blending.
+// PASS_COLOUR: weighted colour and weight, added up; the least depth, if it is not behind the visible surface.
+
+flat in vec4 centre;  // place, depth, radius
+flat in vec2 gradient;
+#ifdef PASS_COLOUR
+flat in vec3 rgb;
+uniform sampler2D front;
+uniform float depth_offset;  // radii
+uniform float falloff;
+layout(location = 0) out vec4 sum;  // weight · colour, depth
+layout(location = 1) out float weight;
+#else
+layout(location = 0) out float front;
+#endif
+uniform float screen_radius_px;
+
+void main() {
+    vec2 delta = gl_FragCoord.xy - centre.xy;
+    float w = centre.z, radius = centre.w;
+    precise float slope = gradient.x * delta.x + gradient.y * delta.y;
+    precise float t = w / (1.0 + slope);  // where the ray meets the plane
+    vec3 p = vec3((centre.xy - center) / focal * w, w);
+    precise vec3 off = (vec3(t * delta / focal, 0.0) - p * (slope / (1.0 + slope))) / radius;
+    precise float disc = off.x * off.x + off.y * off.y + off.z * off.z;
+    precise vec2 close = delta / screen_radius_px;
+    precise float screen = close.x * close.x + close.y * close.y;
+    bool nearer = t >= near && t <= FLOAT_MAX && disc < screen;  // false for NaN, too
+    float rho_2 = nearer ? disc : screen;
+    float depth = nearer ? t : w;
+    if (!(rho_2 <= 1.0)) discard;
+#ifdef PASS_COLOUR
+    precise float least = depth - depth_offset * radius;
+    if (least > texelFetch(front, ivec2(gl_FragCoord.xy), 0).r) discard;
+    weight = exp(-falloff * rho_2);
+    sum = vec4(weight * rgb, depth);
+#else
+    front = depth;
+#endif
+}
