@@ -91,7 +91,12 @@ class Job:
         Its threshold is in pixels of the picture; how many points cover a cell is counted in drawn pixels, so that each
         of those that are averaged has points of its own.
         """
-        return SamplingNode(octree, pixel_threshold=self.pixel_threshold * self.config.render.supersampling)
+        points_per_pixel = self.config.sampling.points_per_pixel
+        return SamplingNode(
+            octree,
+            pixel_threshold=self.pixel_threshold * self.config.render.supersampling,
+            points_per_pixel=points_per_pixel,
+        )
 
     def load_points(self, *, verify: bool) -> ResidentPoints:
         """The points of this run, with what it needs of them. Raises StoreError."""

@@ -33,16 +33,21 @@ class SamplingNode:
     octree : cells in breadth-first order, either point order.
     pixel_threshold : a cell that projects to at most this many pixels across is drawn from its own points, if
         those suffice; 0 draws every visible point.
-    Raises ConfigError for a threshold that is not a finite number ≥ 0.
+    points_per_pixel : of a set in stratified order, drawn for each pixel that its cell covers.
+    Raises ConfigError for a threshold that is not a finite number ≥ 0, or points per pixel that are not one > 0.
     """
 
-    def __init__(self, octree: Octree, *, pixel_threshold: float):
+    def __init__(self, octree: Octree, *, pixel_threshold: float, points_per_pixel: float = 2.0):
         if not (pixel_threshold >= 0 and math.isfinite(pixel_threshold)):
             raise ConfigError(f"sampling.pixel_threshold = {pixel_threshold}, expected a number ≥ 0")
+        if not (points_per_pixel > 0 and math.isfinite(points_per_pixel)):
+            raise ConfigError(f"sampling.points_per_pixel = {points_per_pixel}, expected a number > 0")
         self.pixel_threshold = float(pixel_threshold)
+        self.points_per_pixel = float(points_per_pixel)
         self._octree = octree
         self._edge = np.ldexp(octree.edge, -np.arange(MAX_LEVEL + 1))
         self._stored_order = np.argsort(octree.first_point, kind="stable").astype(np.int32)
+        self._area = np.empty(0, np.float32) if octree.area is None else octree.area
         self._n_drawn = np.empty(len(octree), np.int64)
         self._leaf_points = np.where(octree.is_leaf, octree.n_points, 0)
         n_stored = int((octree.first_point + octree.n_points).max())
@@ -51,10 +56,11 @@ class SamplingNode:
     def process(self, camera: Camera, bits: VisibilityBits) -> RenderPoints:
         """The render-points array of one frame, ascending in offset, adjacent ranges merged.
 
-        Every visible leaf has exactly one drawn ancestor-or-self, and nothing invisible is drawn. A drawn
-        cell below the threshold yields at least min(its points, max(1, ⌊N ln N⌋)) of its points, N being the
-        square of its projected size: the head of its range in layered order, every stride-th of the range in
-        depth-first order. A leaf above the threshold yields all its points.
+        Every visible leaf has exactly one drawn ancestor-or-self, and nothing invisible is drawn. N being the
+        square of its projected size, a cell whose points stand in stratified order yields the first
+        max(1, ⌊``points_per_pixel`` N⌋) of them, or all. Any other cell below the threshold yields at least
+        min(its points, max(1, ⌊N ln N⌋)): the head of its range in layered order, every stride-th of the range in
+        depth-first order; and a leaf above the threshold all its points.
 
         Raises MessageError if the bits belong to another frame or another octree.
         Cost: O(cells in the level-of-detail window) plus a scan of one word per cell. With a threshold of 0 no
@@ -93,6 +99,8 @@ class SamplingNode:
             camera.near,
             camera.focal_px,
             self.pixel_threshold,
+            self.points_per_pixel,
+            self._area,
             self._n_drawn,
         )
 
@@ -123,9 +131,12 @@ def _cut(
     near,
     focal_px,
     pixel_threshold,
+    points_per_pixel,
+    area,
     n_drawn,
 ):
     """Fill ``n_drawn``: points to draw of a cut cell, else 0 or ``_EXPANDED``. Returns the size of the cut."""
+    stratified = len(area) > 0
     n_cut = 0
     window_end = 1
     cell = 0
@@ -141,12 +152,15 @@ def _cut(
                 distance_2 += gap * gap
             n_pixels = edge_px * edge_px / max(distance_2, near * near)  # nothing is drawn in front of near
             is_leaf = first_child[cell] < 0
-            if n_pixels <= pixel_threshold * pixel_threshold:
+            is_small = n_pixels <= pixel_threshold * pixel_threshold
+            if stratified:
+                needed = max(1.0, np.floor(points_per_pixel * area[cell] * n_pixels))
+            else:
                 needed = points_needed(n_pixels)
-                if is_leaf or n_points[cell] >= min(needed, n_below[cell]):
-                    n_drawn[cell] = np.int64(min(needed, n_points[cell]))
-            elif is_leaf:
+            if is_leaf and not (is_small or stratified):
                 n_drawn[cell] = n_points[cell]
+            elif is_leaf or (is_small and n_points[cell] >= min(needed, n_below[cell])):
+                n_drawn[cell] = np.int64(min(needed, n_points[cell]))
             if n_drawn[cell] > 0:
                 n_cut += 1
             elif not is_leaf:

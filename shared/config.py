@@ -91,7 +91,8 @@ class CullingSection(Section):
 class SamplingSection(Section):
     """``[sampling]``."""
 
-    pixel_threshold: Annotated[float, Field(ge=0, le=4096)] = 16.0
+    pixel_threshold: Annotated[float, Field(ge=0, le=4096)] = 32.0
+    points_per_pixel: Annotated[float, Field(gt=0, le=64)] = 2.0
 
 
 class RenderSection(Section):

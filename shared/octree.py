@@ -17,7 +17,7 @@ MAX_LEVEL = 21
 
 
 FEATURES = ("none", "flat", "edge", "corner")
-"""Names of the codes of ``Octree.feature``; ``none``: points that fill space, or too few to tell."""
+"""Names of the codes of ``Octree.feature``; ``none``: curved, on a line, or too few points to tell."""
 FLAT, EDGE, CORNER = 1, 2, 3
 
 
@@ -32,12 +32,15 @@ class Octree:
     first_child : (n,) int32, −1 for a leaf.  n_children : (n,) uint8, 0…8.
     first_point, n_points : (n,) int64, the cell's contiguous range in the point-array.
     n_below : (n,) int64, input points inside the cell's cube.
+    area : (n,) float32 or None, surface inside the cell in faces of its cube, estimated; None where sets stand in random
+        order and not in stratified order (``build.sets``).
     cone : (n, 4) float32 or None: unit axis and cosine of the half angle of a cone that holds every normal below the
         cell; a cosine of −1 means "any direction".
-    feature : (n,) uint8 or None: what the points below the cell look like, one of ``FEATURES`` (thesis 4.3.1).
+    feature : (n,) uint8 or None: what the points of the cell's own range look like (thesis 4.3.1), a code of
+        ``FEATURES``.
     quad : (n, 3, 3) float32 or None, of flat cells: centre relative to the cell's centre, and the two half axes of the
-        rectangle that covers the cell's points; world units.
-    point_order : ``layered`` (an inner cell owns its own level-of-detail set, in random order, so any prefix is a
+        rectangle that covers these points; world units.
+    point_order : ``layered`` (an inner cell owns its own level-of-detail set, of which any prefix is a
         fair sample) or ``depth-first`` (points in leaves only, an inner cell's range spans its leaves).
     """
 
@@ -53,6 +56,7 @@ class Octree:
     n_below: np.ndarray
     cone: np.ndarray | None
     point_order: str
+    area: np.ndarray | None = None
     feature: np.ndarray | None = None
     quad: np.ndarray | None = None
 

@@ -18,6 +18,7 @@ from splatpipe.shared.messages import VisibilityBits
 
 EXAMPLES = settings(max_examples=200, derandomize=True, deadline=None)
 THRESHOLDS = st.sampled_from([0.0, 0.7, 3.0, 16.0, 200.0, 1e9])
+DENSITY = 1.7  # points a pixel
 
 
 def projected_pixels(octree, camera, cell):
@@ -28,13 +29,15 @@ def projected_pixels(octree, camera, cell):
     return (2 * half * camera.focal_px / distance) ** 2
 
 
-def needed(n_pixels):
-    return max(1, math.floor(n_pixels * math.log(n_pixels)))
-
-
 def cut_twin(octree, camera, visible, threshold):
     """{cell: points to draw}, by recursion from the root."""
     drawn = {}
+    stratified = octree.area is not None
+
+    def needed(cell, n_pixels):
+        if stratified:
+            return max(1, math.floor(DENSITY * float(octree.area[cell]) * n_pixels))
+        return max(1, math.floor(n_pixels * math.log(n_pixels)))
 
     def visit(cell):
         if not visible[cell]:
@@ -43,9 +46,10 @@ def cut_twin(octree, camera, visible, threshold):
         small = n_pixels <= threshold**2
         n_points = int(octree.n_points[cell])
         if octree.is_leaf[cell]:
-            drawn[cell] = min(needed(n_pixels), n_points) if small else n_points
-        elif small and n_points >= min(needed(n_pixels), octree.n_below[cell]):
-            drawn[cell] = min(needed(n_pixels), n_points)
+            everything = threshold == 0 or not (small or stratified)
+            drawn[cell] = n_points if everything else min(needed(cell, n_pixels), n_points)
+        elif small and n_points >= min(needed(cell, n_pixels), octree.n_below[cell]):
+            drawn[cell] = min(needed(cell, n_pixels), n_points)
         else:
             for child in range(octree.first_child[cell], octree.first_child[cell] + octree.n_children[cell]):
                 visit(child)
@@ -68,13 +72,19 @@ def expand(entries):
     return np.concatenate([np.empty(0, np.int64), *ranges])
 
 
+def with_areas(octree):
+    """The octree as if the sets of a layered one stood in stratified order."""
+    area = np.random.default_rng(len(octree)).uniform(0.01, 4, len(octree)).astype(np.float32)
+    return replace(octree, area=area) if octree.point_order == "layered" else octree
+
+
 @EXAMPLES
-@given(scenes(), THRESHOLDS)
-def test_draws_exactly_the_points_of_its_twin(scene, threshold):
+@given(scenes(), THRESHOLDS, st.booleans())
+def test_draws_exactly_the_points_of_its_twin(scene, threshold, stratified):
     cloud, camera = scene
-    octree = cloud.octree
+    octree = with_areas(cloud.octree) if stratified else cloud.octree
     bits = CullingNode(octree, backface=True).process(camera)
-    message = SamplingNode(octree, pixel_threshold=threshold).process(camera, bits)
+    message = SamplingNode(octree, pixel_threshold=threshold, points_per_pixel=DENSITY).process(camera, bits)
     drawn = cut_twin(octree, camera, bits.unpack(), threshold)
     unmerged = [points_of(octree, cell, n) for cell, n in drawn.items()]
     np.testing.assert_array_equal(expand(message.entries), np.sort(np.concatenate([np.empty(0, int), *unmerged])))
@@ -83,13 +93,14 @@ def test_draws_exactly_the_points_of_its_twin(scene, threshold):
 
 
 @EXAMPLES
-@given(scenes(), THRESHOLDS)
-def test_every_visible_leaf_has_exactly_one_drawn_ancestor_or_self(scene, threshold):
+@given(scenes(), THRESHOLDS, st.booleans())
+def test_every_visible_leaf_has_exactly_one_drawn_ancestor_or_self(scene, threshold, stratified):
     cloud, camera = scene
-    octree = cloud.octree
+    octree = with_areas(cloud.octree) if stratified else cloud.octree
     bits = CullingNode(octree, backface=False).process(camera)
     visible = bits.unpack()
-    drawn_points = expand(SamplingNode(octree, pixel_threshold=threshold).process(camera, bits).entries)
+    node = SamplingNode(octree, pixel_threshold=threshold, points_per_pixel=DENSITY)
+    drawn_points = expand(node.process(camera, bits).entries)
 
     # Who owns a drawn point is read from the entries alone: the cut cell is the one cell of the twin's cut
     # whose range holds it; layered ranges are disjoint, depth-first ones are nested but a cut takes one of
@@ -187,6 +198,12 @@ def small():
 def test_a_threshold_out_of_range_is_refused(small, threshold):
     with pytest.raises(ConfigError, match="pixel_threshold"):
         SamplingNode(small[0], pixel_threshold=threshold)
+
+
+@pytest.mark.parametrize("density", [0.0, -1.0, math.nan, math.inf])
+def test_points_per_pixel_out_of_range_are_refused(small, density):
+    with pytest.raises(ConfigError, match="points_per_pixel"):
+        SamplingNode(small[0], pixel_threshold=1.0, points_per_pixel=density)
 
 
 def test_more_pixels_than_an_integer_holds(small):
