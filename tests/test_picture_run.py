@@ -10,6 +10,7 @@ import numpy as np
 import png
 import pytest
 from PIL import Image
+from splatpipe.cluster.error.config import load_error_config
 from splatpipe.cluster.job import Job
 from splatpipe.cluster.launch import mpi_available
 from splatpipe.cluster.plan.topology import estimate
@@ -216,3 +217,17 @@ def test_counts_are_of_views_as_they_are_drawn(config, view, views, pixels):
     assert estimate(job, replace(look, culling_s=1e-4, sampling_s=1e-4), cores=2).busy_s > 0
     measured = Measured(job.config, load, [{"frames_per_s": 3.0}])
     assert measured.frame_s == pytest.approx(1 / (3 * views))
+
+
+@pytest.mark.parametrize(
+    ("section", "key", "value"),
+    [("camera", "view", '"stereo"'), ("render", "supersampling", 2), ("render", "edl_strength", 0.4)],
+)
+def test_the_error_command_refuses_what_it_does_not_measure(tmp_path, section, key, value):
+    path = tmp_path / "error.toml"
+    path.write_text(
+        f'[run.{section}]\n{key} = {value}\n[[scene]]\nname = "a"\npath = "a"\n'
+        '[[sweep]]\nmethod = "m"\nkey = "sampling.pixel_threshold"\nvalues = [4]\n'
+    )
+    with pytest.raises(ConfigError, match=rf"{section}\.{key} = .*frames as they are drawn, expected"):
+        load_error_config(path)

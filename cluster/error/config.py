@@ -21,6 +21,9 @@ SWEPT_SECTIONS = ("sampling", "render", "culling", "positions", "image")
 REFERENCE_KEYS = ("render.colour", "render.colormap", "render.colour_range", "render.background")
 """A sweep may change any key of those sections but these: camera, scene and colour stay what the reference shows."""
 
+_AS_DRAWN = (("camera", "view", "mono"), ("render", "supersampling", 1), ("render", "edl_strength", 0.0))
+"""What composes a picture of frames, and is not measured."""
+
 Value = bool | int | float | str
 
 
@@ -147,7 +150,12 @@ def _changed(config: PointConfig, values: dict[str, Any], source: str) -> PointC
             if not isinstance(table, dict):
                 raise ConfigError(f"{source}: {key}: {section} is not a section")
         table[name] = value
-    return validated(PointConfig, data, source)
+    changed = validated(PointConfig, data, source)
+    for section, key, expected in _AS_DRAWN:
+        if (found := getattr(getattr(changed, section), key)) != expected:
+            why = "errors are measured on frames as they are drawn"
+            raise ConfigError(f"{source}: {section}.{key} = {found!r}: {why}, expected {expected!r}")
+    return changed
 
 
 def _rebased(data: dict[str, Any], folder: Path) -> dict[str, Any]:
