@@ -10,9 +10,11 @@ import pytest
 from build_sources import ArraySource, columns_for
 from splatpipe.cluster.job import Job
 from splatpipe.cluster.launch import mpi_available
-from splatpipe.cluster.plan import needs, topology
+from splatpipe.cluster.plan import part as named
+from splatpipe.cluster.plan import topology
 from splatpipe.cluster.plan.ablation import ablate, same, trials
 from splatpipe.cluster.plan.command import plan_command, report_plan
+from splatpipe.cluster.plan.costs import COSTS
 from splatpipe.cluster.plan.needs import left_out, parts
 from splatpipe.cluster.plan.topology import Decision, choose_topology, decide, estimate
 from splatpipe.cluster.plan.whole_runs import same_pictures
@@ -61,19 +63,31 @@ def names(job: Job, held: bool = True) -> set[str]:
 def test_a_bare_scene_leaves_out_what_it_has_no_use_for(config):
     found = names(job_of(config, "render.colour=#ff8000", "sampling.pixel_threshold=0"))
     assert found == {
-        needs.MPI,
+        named.MPI,
         "compositing",
-        needs.NO_NORMALS,
-        needs.LEVEL_OF_DETAIL,
-        needs.SPLAT_LOOP,
-        needs.COLOUR,
+        named.NO_NORMALS,
+        named.LEVEL_OF_DETAIL,
+        named.CLASSES,
+        named.BOXES,
+        named.SPLAT_LOOP,
+        named.ADAPTIVE,
+        "compact positions",
+        "splat passes, normals and radii",
+        "quads of flat cells",
+        named.COLOUR,
         "attributes intensity",
         "codecs",
         "flatness analysis",
-        needs.OPENGL,
-        needs.COLOUR_MAPS,
-        needs.PNG,
-        needs.FILM,
+        named.OPENGL,
+        named.COLOUR_MAPS,
+        "second eye, panorama",
+        "supersampling",
+        named.LIGHTING,
+        named.PNG,
+        named.FILM,
+        named.DEPTHS,
+        named.NORMALS,
+        "16-bit colours",
     }
 
 
@@ -88,12 +102,42 @@ def test_what_is_asked_for_is_kept(config, scenes):
         "output.mp4=true",
     )
     kept = names(job, held=False)
-    assert kept >= {needs.BACK_FACE, needs.LEVEL_OF_DETAIL, needs.SPLAT_LOOP, needs.COLOUR, needs.COLOUR_MAPS}
-    assert kept >= {needs.CHECKSUMS, needs.PNG, needs.FILM, "stride of render-points entries"}
+    assert kept >= {named.BACK_FACE, named.LEVEL_OF_DETAIL, named.SPLAT_LOOP, named.COLOUR, named.COLOUR_MAPS}
+    assert kept >= {named.CHECKSUMS, named.PNG, named.FILM, "stride of render-points entries"}
+
+
+def test_what_a_picture_asks_for_is_kept_and_what_it_costs_is_said(config, scenes):
+    job = job_of(
+        config,
+        f"scene.path={scenes}/city",
+        "filter.classes=[2, 6]",
+        "filter.boxes=[{ lower = [0, 0, 0], upper = [50, 50, 50] }]",
+        "render.point_size_adaptive=true",
+        "render.positions=compact",
+        "render.supersampling=2",
+        "render.edl_strength=0.5",
+        "camera.view=stereo",
+        "output.png_bits=16",
+        "output.depth=true",
+        "output.normals=true",
+    )
+    kept = {
+        part.what: part for part in parts(job, Workload.of_look(job), Decision("single", "so")) if not part.left_out
+    }
+    assert kept.keys() >= {named.CLASSES, named.BOXES, named.ADAPTIVE, named.LIGHTING, named.DEPTHS, named.NORMALS}
+    assert kept.keys() >= {"compact positions", "supersampling", "second eye, panorama", "16-bit colours"}
+    assert "2, 6" in kept[named.CLASSES].why
+    assert all(part.gain > 0 for part in kept.values() if part.gain is not None)
+    drawn, composed = 4 * 96 * 64, 96 * 64
+    assert kept["16-bit colours"].gain == 4 * composed
+    assert kept["supersampling"].gain == pytest.approx((COSTS.pixel_s + COSTS.average_s) * drawn * 1e3)
+    unlit = estimate(job_of(config), WORK, cores=2)
+    lit = estimate(job_of(config, "render.edl_strength=0.5", "output.png=true"), WORK, cores=2)
+    assert lit.render_s - unlit.render_s == pytest.approx(WORK.pixels * (COSTS.edl_s / 2 + COSTS.picture_s))
 
 
 def test_a_scene_of_one_cell_has_no_level_of_detail(config, scenes):
-    assert needs.LEVEL_OF_DETAIL in names(job_of(config, f"scene.path={scenes}/one"))
+    assert named.LEVEL_OF_DETAIL in names(job_of(config, f"scene.path={scenes}/one"))
 
 
 def test_gains_are_counts_times_unit_costs(config):
@@ -101,7 +145,7 @@ def test_gains_are_counts_times_unit_costs(config):
     work = Workload.of_look(job)
     found = {item["what"]: item for item in left_out(job, work, Decision("single", "so"))}
     assert found["compositing"]["gain"] == 96 * 64 * 8
-    assert found[needs.COLOUR]["gain"] == pytest.approx(4e-6 * job.scene.info.n_stored)
+    assert found[named.COLOUR]["gain"] == pytest.approx(4e-6 * job.scene.info.n_stored)
     assert found["attributes intensity"]["gain"] == pytest.approx(4e-6 * job.scene.info.n_stored)
     assert all(item["gain"] is None or item["gain"] > 0 for item in found.values())
     assert all(item["why"] and item["unit"] and item["basis"] for item in found.values())
@@ -206,21 +250,25 @@ def test_a_forced_topology_reaches_the_ranks_with_its_reason(config):
 
 # --- ablation: error added = 0 -----------------------------------------------------------------------------------
 
+ONE_PIXEL = named.SPLAT_LOOP, named.ADAPTIVE
+ALWAYS = {named.CHECKSUMS, named.BOXES, named.LIGHTING, named.PNG, named.DEPTHS, named.NORMALS}
+
 
 @pytest.mark.parametrize(
     ("scene", "sets", "expected"),
     [
-        ("bare", ["render.colour=#ff8000"], {needs.NO_NORMALS, needs.SPLAT_LOOP, needs.COLOUR}),
-        ("bare", ["sampling.pixel_threshold=0"], {needs.NO_NORMALS, needs.SPLAT_LOOP, needs.LEVEL_OF_DETAIL}),
-        ("bare", ["render.point_size_px=3", "render.colour=#ff8000"], {needs.NO_NORMALS, needs.COLOUR}),
-        ("city", ["sampling.pixel_threshold=0"], {needs.LEVEL_OF_DETAIL, needs.SPLAT_LOOP}),
-        ("one", ["render.threads=1", "render.colour=#ff8000"], {needs.NO_NORMALS, needs.SPLAT_LOOP, needs.COLOUR}),
+        ("bare", ["render.colour=#ff8000"], {named.NO_NORMALS, *ONE_PIXEL, named.COLOUR}),
+        ("bare", ["sampling.pixel_threshold=0"], {named.NO_NORMALS, *ONE_PIXEL, named.LEVEL_OF_DETAIL}),
+        ("bare", ["render.point_size_px=3", "render.colour=#ff8000"], {named.NO_NORMALS, named.COLOUR}),
+        ("city", ["sampling.pixel_threshold=0"], {named.LEVEL_OF_DETAIL, *ONE_PIXEL, named.CLASSES}),
+        ("city", ["filter.classes=[2, 6]", "render.supersampling=2"], set()),
+        ("one", ["render.threads=1", "render.colour=#ff8000"], {named.NO_NORMALS, *ONE_PIXEL, named.COLOUR}),
     ],
 )
 def test_leaving_out_adds_no_error(config, scenes, scene, sets, expected):
     job = job_of(config, f"scene.path={scenes}/{scene}", *sets)
     with trials(job) as found:
-        assert {trial.part for trial in found} == expected | {needs.CHECKSUMS, needs.PNG}
+        assert {trial.part for trial in found} == expected | ALWAYS
         for trial in found:
             for frame in range(job.n_frames):
                 assert same(trial, job.camera(frame)), trial.part
@@ -229,14 +277,14 @@ def test_leaving_out_adds_no_error(config, scenes, scene, sets, expected):
 def test_a_trial_that_changes_a_bit_is_found_out(config):
     job = job_of(config)
     with trials(job) as found:
-        trial = next(trial for trial in found if trial.part == needs.SPLAT_LOOP)
+        trial = next(trial for trial in found if trial.part == named.SPLAT_LOOP)
         changed = replace(trial, with_part=lambda camera: trial.without(camera) ^ np.uint64(1))
         assert not same(changed, job.camera(0))
 
 
 def test_every_ablation_says_what_it_saved_and_that_nothing_changed(config):
     found = ablate(job_of(config, "render.colour=#ff8000"), n_frames=2)
-    assert {a.part for a in found} == {needs.NO_NORMALS, needs.SPLAT_LOOP, needs.COLOUR, needs.CHECKSUMS, needs.PNG}
+    assert {a.part for a in found} == {named.NO_NORMALS, *ONE_PIXEL, named.COLOUR} | ALWAYS
     assert all(a.identical and a.repeats >= 5 for a in found)
     assert all(a.without_ms["median"] > 0 and a.with_ms["median"] > 0 for a in found)
 

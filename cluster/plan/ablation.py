@@ -14,11 +14,13 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
 from ...nodes.culling import CullingNode
-from ...nodes.picture.compose import Composer
+from ...nodes.picture.compose import Composer, Picture
+from ...nodes.point_filter import ClipBox, PointFilter
 from ...nodes.raster import PointSize, Rasterizer, ResidentPoints
 from ...nodes.raster.choose import make_rasterizer
 from ...nodes.render import load_points
@@ -27,13 +29,37 @@ from ...shared.camera import Camera
 from ..job import Job
 from ..record import spread_ms
 from ..sink import FrameSink
-from .needs import CHECKSUMS, COLOUR, LEVEL_OF_DETAIL, NO_NORMALS, PNG, SPLAT_LOOP
+from .part import (
+    ADAPTIVE,
+    BOXES,
+    CHECKSUMS,
+    CLASSES,
+    COLOUR,
+    DEPTHS,
+    LEVEL_OF_DETAIL,
+    LIGHTING,
+    NO_NORMALS,
+    NORMALS,
+    PNG,
+    SPLAT_LOOP,
+)
 
 _ONE_PIXEL_BY_SIZE = PointSize(1, world=1e-30, maximum=1)
 """One pixel, but only the kernel with sizes finds that out."""
 
+_ONE_PIXEL_BY_SPACING = PointSize(1, maximum=1, adaptive=True)
+
+_NO_LIGHTING = 1e-30
+"""A strength of eye-dome lighting that changes no colour."""
+
+_ALL_CLASSES = PointFilter(classes=tuple(range(256)))
+_WHOLE_WORLD = PointFilter(boxes=(ClipBox((-1e300, -1e300, -1e300), (1e300, 1e300, 1e300)),))
+
 _NEVER_BELOW_PX = 1e-150
 """A threshold that no cell projects to: level of detail is computed and never used."""
+
+_MORE_THAN_ANY = 1e200
+"""Points for a pixel, of which no leaf has enough: it is drawn whole."""
 
 _LEAST_S = 0.3
 _LEAST_REPEATS = 5
@@ -114,7 +140,20 @@ def trials(job: Job) -> Iterator[list[Trial]]:
     """The trials that apply to a run, with its scene and rasterizers open."""
     with ExitStack() as stack:
         bench = _Bench(job, stack)
-        kinds = (_back_face_test, _level_of_detail, _splat_loop, _colour_column, _checksums, _png)
+        kinds = (
+            _back_face_test,
+            _level_of_detail,
+            _class_filter,
+            _clip_boxes,
+            _splat_loop,
+            _adaptive_size,
+            _colour_column,
+            _checksums,
+            _lighting,
+            _png,
+            _depths,
+            _normals,
+        )
         yield [trial for trial in (kind(bench) for kind in kinds) if trial is not None]
 
 
@@ -132,7 +171,12 @@ class _Bench:
     @cached_property
     def points(self) -> ResidentPoints:
         """The points of the run."""
-        return load_points(self.job.scene, self.job.colouring, verify=False)
+        return self.job.load_points(verify=False)
+
+    def load(self, **wanted: Any) -> ResidentPoints:
+        """The points of the run with more wanted of them."""
+        job = self.job
+        return load_points(job.scene, job.colouring, replace(job.wanted, **wanted), verify=False)
 
     def entries(self, camera: Camera) -> np.ndarray:
         """What the run draws of a frame; the second time nothing is computed."""
@@ -142,8 +186,11 @@ class _Bench:
 
     def rasterizer(self, points: ResidentPoints, size: PointSize) -> Rasterizer:
         """The rasterizer of the run over these points."""
-        camera, render = self.job.config.camera, self.job.config.render
-        maker = make_rasterizer(render.rasterizer, points, camera.width, camera.height, size, render.threads or None)
+        job, render = self.job, self.job.config.render
+        width, height, threads = job.views.width, job.views.height, render.threads or None
+        maker = make_rasterizer(
+            render.rasterizer, points, width, height, size, threads, splats=job.splats, compact=job.compact
+        )
         return self.stack.enter_context(maker)
 
     def drawing(self, rasterizer: Rasterizer) -> Callable[[Camera], np.ndarray]:
@@ -154,6 +201,16 @@ class _Bench:
     def draw(self) -> Callable[[Camera], np.ndarray]:
         """As the run draws."""
         return self.drawing(self.rasterizer(self.points, self.job.point_size))
+
+    def composing(self, **settings: Any) -> Callable[[Camera], tuple[np.ndarray, Picture | None]]:
+        """Camera → words as the run draws them, and the picture that they complete."""
+        composer = self.stack.enter_context(Composer(replace(self.job.picture_settings, **settings)))
+
+        def compose(camera: Camera) -> tuple[np.ndarray, Picture | None]:
+            words = self.draw(camera)
+            return words, composer.add(camera.frame % self.job.views.per_picture, camera, words)
+
+        return compose
 
 
 def _back_face_test(bench: _Bench) -> Trial | None:
@@ -171,7 +228,7 @@ def _level_of_detail(bench: _Bench) -> Trial | None:
     if bench.job.pixel_threshold > 0:
         return None
     culling, plain = bench.culling, bench.sampling
-    levelled = SamplingNode(bench.octree, pixel_threshold=_NEVER_BELOW_PX)
+    levelled = SamplingNode(bench.octree, pixel_threshold=_NEVER_BELOW_PX, points_per_pixel=_MORE_THAN_ANY)
     return Trial(
         LEVEL_OF_DETAIL,
         lambda camera: plain.process(camera, culling.process(camera)).entries,
@@ -180,9 +237,40 @@ def _level_of_detail(bench: _Bench) -> Trial | None:
 
 
 def _splat_loop(bench: _Bench) -> Trial | None:
-    if bench.job.largest_point_px > 1:
+    if bench.job.largest_point_px > 1 or bench.job.splats:
         return None
     return Trial(SPLAT_LOOP, bench.draw, bench.drawing(bench.rasterizer(bench.points, _ONE_PIXEL_BY_SIZE)))
+
+
+def _adaptive_size(bench: _Bench) -> Trial | None:
+    """Put back by a spacing of each cell that a largest side of one pixel undoes."""
+    if bench.job.largest_point_px > 1 or bench.job.splats:
+        return None
+    points = bench.load(cells=True, spacing=True)
+    return Trial(ADAPTIVE, bench.draw, bench.drawing(bench.rasterizer(points, _ONE_PIXEL_BY_SPACING)))
+
+
+def _class_filter(bench: _Bench) -> Trial | None:
+    """Put back by a filter that keeps every class, of a scene that has them."""
+    if bench.job.point_filter.classes or "classification" not in bench.job.scene.info.attributes:
+        return None
+    return _loading(bench, CLASSES, _ALL_CLASSES)
+
+
+def _clip_boxes(bench: _Bench) -> Trial | None:
+    """Put back by a box that holds everything."""
+    return None if bench.job.point_filter.boxes else _loading(bench, BOXES, _WHOLE_WORLD)
+
+
+def _loading(bench: _Bench, part: str, keeps_all: PointFilter) -> Trial:
+    given = bench.job.point_filter
+    both = PointFilter(given.classes or keeps_all.classes, given.boxes or keeps_all.boxes)
+    return Trial(
+        part,
+        lambda _: bench.load().x.view(np.uint32),  # bits, so that what is filtered out equals itself
+        lambda _: bench.load(point_filter=both).x.view(np.uint32),
+        once=True,
+    )
 
 
 def _colour_column(bench: _Bench) -> Trial | None:
@@ -195,24 +283,50 @@ def _colour_column(bench: _Bench) -> Trial | None:
 
 def _checksums(bench: _Bench) -> Trial | None:
     def load(verify: bool) -> np.ndarray:
-        return load_points(bench.job.scene, bench.job.colouring, verify=verify).x
+        return bench.job.load_points(verify=verify).x.view(np.uint32)
 
     return Trial(CHECKSUMS, lambda _: load(False), lambda _: load(True), once=True)
 
 
-def _png(bench: _Bench) -> Trial | None:
-    """Put back frame by frame: one core encodes while nothing else is done."""
-    if bench.job.config.output.png:
+def _lighting(bench: _Bench) -> Trial | None:
+    """Put back with a strength that darkens nothing."""
+    if bench.job.config.render.edl_strength:
         return None
+
+    def colours(edl_strength: float) -> Callable[[Camera], np.ndarray]:
+        compose = bench.composing(colours=True, edl_strength=edl_strength)
+
+        def draw(camera: Camera) -> np.ndarray:
+            words, picture = compose(camera)
+            return words if picture is None or picture.rgba is None else picture.rgba
+
+        return draw
+
+    return Trial(LIGHTING, colours(0.0), colours(_NO_LIGHTING))
+
+
+def _png(bench: _Bench) -> Trial | None:
+    return None if bench.job.config.output.png else _output(bench, PNG, "colours")
+
+
+def _depths(bench: _Bench) -> Trial | None:
+    return None if bench.job.config.output.depth else _output(bench, DEPTHS, "depth")
+
+
+def _normals(bench: _Bench) -> Trial | None:
+    return None if bench.job.config.output.normals else _output(bench, NORMALS, "normals")
+
+
+def _output(bench: _Bench, part: str, layer: str) -> Trial:
+    """Put back frame by frame: one core encodes while nothing else is done."""
     folder = Path(bench.stack.enter_context(TemporaryDirectory()))
-    composer = bench.stack.enter_context(Composer(replace(bench.job.picture_settings, colours=True)))
+    compose = bench.composing(**{"colours": False, "depth": False, "normals": False, layer: True})
 
     def encode(camera: Camera) -> np.ndarray:
-        words = bench.draw(camera)
-        picture = composer.add(camera.frame % bench.job.views.per_picture, camera, words)
+        words, picture = compose(camera)
         if picture is not None:
             with FrameSink(folder, png=True, mp4=False, fps=1.0) as sink:
                 sink.put(camera.frame, picture)
         return words
 
-    return Trial(PNG, bench.draw, encode)
+    return Trial(part, bench.draw, encode)

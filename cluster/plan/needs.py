@@ -3,43 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from ...nodes.raster.choose import resolve_rasterizer
 from ...shared.messages import FRAMEBUFFER_EMPTY, RENDER_POINT
 from ..job import Job
-from .topology import COSTS, Decision
+from .costs import COSTS
+from .part import (
+    ADAPTIVE,
+    BACK_FACE,
+    BOXES,
+    CHECKSUMS,
+    CLASSES,
+    COLOUR,
+    COLOUR_MAPS,
+    LEVEL_OF_DETAIL,
+    MPI,
+    NO_NORMALS,
+    OPENGL,
+    SPLAT_LOOP,
+    Part,
+)
+from .picture_needs import picture_parts
+from .topology import Decision
 from .workload import Workload
 
-MPI, OPENGL, PNG, FILM = "MPI", "OpenGL", "PNG encoding", "film encoding"
-NO_NORMALS, BACK_FACE = "normals and back-face test", "back-face test"
-LEVEL_OF_DETAIL, SPLAT_LOOP = "level of detail", "splat loop and attenuation"
-COLOUR, COLOUR_MAPS, CHECKSUMS = "colour column", "colour maps", "checksums"
-
-_MEASURED_UNITS = {CHECKSUMS: "ms of loading"}
+_MEASURED_UNITS: dict[str, str] = dict.fromkeys((CHECKSUMS, CLASSES, BOXES), "ms of loading")
+_FEATURE_BYTES = 8 + 8 + 1 + 24 + 24  # CellFeatures, a cell
 _COLOUR_MAPPED = ("intensity", "elevation", "level")
-
-
-@dataclass(frozen=True)
-class Part:
-    """One part of the program.
-
-    left_out : whether this run does without it.  why : the fact that decides it.
-    gain, unit : what leaving it out saves or, of a part that is kept, would save; None where nothing is known.
-    basis : ``counted`` (bytes that are not there), ``predicted`` (counts × unit costs) or ``measured``.
-    """
-
-    what: str
-    left_out: bool
-    why: str
-    gain: float | None
-    unit: str
-    basis: str = "predicted"
-
-    def as_dict(self) -> dict[str, Any]:
-        """For ``run.json``: what, why and gain."""
-        return {"what": self.what, "why": self.why, "gain": self.gain, "unit": self.unit, "basis": self.basis}
 
 
 def parts(job: Job, work: Workload, decision: Decision) -> list[Part]:
@@ -50,7 +42,13 @@ def parts(job: Job, work: Workload, decision: Decision) -> list[Part]:
         _back_face_test(job, work),
         _level_of_detail(job, work),
         _render_point_stride(job, work),
+        _class_filter(job),
+        _clip_boxes(job),
         _splat_loop(job, work),
+        _adaptive_size(job, work),
+        _compact_positions(job),
+        _splats(job, work),
+        _quads(job, work),
         _colour(job),
         *_attributes(job),
         _codec(),
@@ -58,8 +56,7 @@ def parts(job: Job, work: Workload, decision: Decision) -> list[Part]:
         _checksums(job),
         _opengl(job),
         _colour_maps(job),
-        _encoding(job, work, PNG, "output.png", job.config.output.png, COSTS.png_s),
-        _encoding(job, work, FILM, "output.mp4", job.config.output.mp4, COSTS.mp4_s),
+        *picture_parts(job, work),
     ]
 
 
@@ -119,12 +116,68 @@ def _render_point_stride(job: Job, work: Workload) -> Part:
     return Part("stride of render-points entries", False, why, stride_bytes, "bytes/frame", "counted")
 
 
+def _class_filter(job: Job) -> Part:
+    classes = job.point_filter.classes
+    why = (
+        f"only classes {', '.join(map(str, classes))} are drawn"
+        if classes
+        else "filter.classes is empty: all are drawn"
+    )
+    return Part(CLASSES, not classes, why, COSTS.class_s * job.scene.info.n_stored, "s of loading")
+
+
+def _clip_boxes(job: Job) -> Part:
+    n = len(job.point_filter.boxes)
+    cost_s = COSTS.box_s * max(n, 1) * job.scene.info.n_stored
+    return Part(
+        BOXES,
+        not n,
+        f"{n} boxes, applied once, and cells beyond them are spared" if n else "filter.boxes is empty",
+        cost_s,
+        "s of loading",
+    )
+
+
 def _splat_loop(job: Job, work: Workload) -> Part:
     cost_ms = COSTS.sized_s * work.points * 1e3
+    if job.splats:
+        return Part(SPLAT_LOOP, True, "splats have radii of their own", cost_ms, "core-ms/frame")
     if job.largest_point_px == 1:
         why = "points are one pixel: the kernel without sizes and inner loop is used"
         return Part(SPLAT_LOOP, True, why, cost_ms, "core-ms/frame")
     return Part(SPLAT_LOOP, False, f"points are up to {job.largest_point_px} px wide", cost_ms, "core-ms/frame")
+
+
+def _adaptive_size(job: Job, work: Workload) -> Part:
+    cost_s = COSTS.spacing_s * work.cells
+    why = "render.point_size_adaptive is " + (
+        "true: sides follow the spacing of each cell" if job.wanted.spacing else "false"
+    )
+    return Part(ADAPTIVE, not job.wanted.spacing, why, cost_s, "s of loading")
+
+
+def _compact_positions(job: Job) -> Part:
+    cost_s = COSTS.compact_s * job.scene.info.n_stored
+    if job.compact:
+        why = "render.positions is compact: 4 or 8 bytes a point are read for its 12"
+        return Part("compact positions", False, why, cost_s, "s of loading")
+    return Part(
+        "compact positions", True, "render.positions is float32: drawn as they are stored", cost_s, "s of loading"
+    )
+
+
+def _splats(job: Job, work: Workload) -> Part:
+    cost_ms = (COSTS.splat_s - COSTS.point_s) * work.points * 1e3
+    why = f"render.style is {job.config.render.style}"
+    return Part("splat passes, normals and radii", job.splats is None, why, cost_ms, "core-ms/frame")
+
+
+def _quads(job: Job, work: Workload) -> Part:
+    size_mb = 1e-6 * _FEATURE_BYTES * work.cells
+    why = (
+        f"splats.features is {str(job.config.splats.features).lower()}" if job.splats else "points are drawn, no splats"
+    )
+    return Part("quads of flat cells", not job.wanted.features, why, size_mb, "MB resident", "counted")
 
 
 def _colour(job: Job) -> Part:
@@ -140,7 +193,7 @@ def _attributes(job: Job) -> list[Part]:
     if not unused:
         return []
     size_mb = 1e-6 * sum(info.arrays[f"attr_{name}"].bytes for name in unused)
-    why = "neither colour nor culling reads them"
+    why = "nothing of this run reads them"
     return [Part(f"attributes {', '.join(unused)}", True, why, size_mb, "MB read", "counted")]
 
 
@@ -175,7 +228,3 @@ def _colour_maps(job: Job) -> Part:
     mapped = job.colouring.mode in _COLOUR_MAPPED
     why = f"colour {job.colouring.mode} " + ("goes through one" if mapped else "needs none: matplotlib is not imported")
     return Part(COLOUR_MAPS, not mapped, why, COSTS.colour_maps_s, "s of starting")
-
-
-def _encoding(job: Job, work: Workload, what: str, key: str, wanted: bool, unit_s: float) -> Part:
-    return Part(what, not wanted, f"{key} is {str(wanted).lower()}", unit_s * work.pixels * 1e3, "core-ms/frame")

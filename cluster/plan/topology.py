@@ -17,49 +17,10 @@ from ...nodes.raster.choose import resolve_rasterizer
 from ...shared.messages import RENDER_POINT
 from ..job import Job
 from ..launch import mpi_available
+from .costs import COSTS, UnitCosts, compose_core_s, draw_core_s
 from .workload import Workload
 
 Topology = Literal["single", "pipelined"]
-
-
-@dataclass(frozen=True)
-class UnitCosts:
-    """Seconds of one core for a unit of work, from runs on 2 cores of an Intel Xeon without a GPU.
-
-    They stand only for what cannot be tried without loading the points: culling and sampling are timed where the run
-    starts. Another machine's clock scales them together, which moves no decision.
-
-    point_s, square_s : drawing a point of one pixel, of 3×3; sized_s : more for one pixel found by size.
-    pixel_s : clearing and merging a framebuffer word.
-    entry_s : of a render-points entry, before the threads start.
-    gl_point_s : of a GPU, which takes no core; not measured.  picture_s, png_s, mp4_s : of a pixel.
-    message_s, message_byte_s : a frame's messages and waits, each of their bytes.
-    start_s : three ranks instead of one, until the first frame.
-    back_face_s, lod_s : of a cell.  flatness_s : of a point, when building.  checksum_s : of a byte.
-    opengl_s, colour_maps_s : import, and for OpenGL a context.
-    """
-
-    point_s: float = 4e-9
-    square_s: float = 13e-9
-    sized_s: float = 5e-9
-    pixel_s: float = 1.5e-9
-    entry_s: float = 0.2e-6
-    gl_point_s: float = 0.5e-9
-    picture_s: float = 3e-9
-    png_s: float = 34e-9
-    mp4_s: float = 29e-9
-    message_s: float = 0.5e-3
-    message_byte_s: float = 1e-9
-    start_s: float = 2.0
-    back_face_s: float = 5e-9
-    lod_s: float = 6e-9
-    flatness_s: float = 180e-9
-    checksum_s: float = 0.4e-9
-    opengl_s: float = 0.1
-    colour_maps_s: float = 0.1
-
-
-COSTS = UnitCosts()
 
 
 @dataclass(frozen=True)
@@ -105,16 +66,12 @@ def estimate(job: Job, work: Workload, cores: int, costs: UnitCosts = COSTS) -> 
     """What an average frame takes on one rank and on three that share ``cores``."""
     output = job.config.output
     composed = work.pixels * job.composed_share
-    shown = output.png or output.mp4
+    shown = output.png or output.mp4 or output.depth or output.normals
     alone_s = costs.entry_s * work.entries + costs.picture_s * work.pixels * shown  # on one core, others wait
-    if resolve_rasterizer(job.config.render.rasterizer) == "cpu":
-        threads = min(job.config.render.threads or cores, cores)
-        point_s = costs.point_s if job.largest_point_px == 1 else costs.square_s
-        render_core_s = point_s * work.points + costs.pixel_s * work.pixels
-        render_s = render_core_s / threads + alone_s
-    else:
-        render_core_s = 0.0
-        render_s = costs.gl_point_s * work.points + alone_s
+    threads = min(job.config.render.threads or cores, cores)
+    render_core_s = draw_core_s(job, work, costs) + compose_core_s(job, work, costs) * shown
+    gpu_s = 0.0 if resolve_rasterizer(job.config.render.rasterizer) == "cpu" else costs.gl_point_s * work.points
+    render_s = render_core_s / threads + gpu_s + alone_s
     encode_s = (costs.png_s * output.png + costs.mp4_s * output.mp4) * composed
     busy_s = work.culling_s + work.sampling_s + render_core_s + alone_s + encode_s
     stages = work.culling_s, work.sampling_s, render_s

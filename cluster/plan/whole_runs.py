@@ -15,7 +15,7 @@ from ..launch import mpi_available
 from ..measured import measured_run
 from ..record import spread_ms
 from .ablation import Ablation
-from .needs import COLOUR_MAPS, FILM, MPI, OPENGL
+from .part import COLOUR_MAPS, FILM, MPI, OPENGL
 
 _MODULES = {OPENGL: "moderngl", COLOUR_MAPS: "matplotlib", MPI: "mpi4py.MPI", FILM: "av"}
 _FRAMES = 40
