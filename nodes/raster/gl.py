@@ -93,15 +93,36 @@ class _GlPointRasterizer(GlResident):
 
 
 class GlComputeRasterizer(_GlPointRasterizer):
-    """Compute shaders: 64-bit atomic minimum where the driver has it, else a depth pass and a colour pass."""
+    """Compute shaders: 64-bit atomic minimum where the driver has it, else a depth pass and a colour pass.
+
+    two_passes : take two passes in any case. Other arguments and errors as of ``_GlPointRasterizer``.
+    """
 
     name = "gl"
+
+    def __init__(
+        self,
+        points: ResidentPoints,
+        width: int,
+        height: int,
+        size: PointSize = PointSize(),  # noqa: B008 - frozen
+        device_index: int = 0,
+        *,
+        two_passes: bool = False,
+    ) -> None:
+        self._two_passes = two_passes
+        super().__init__(points, width, height, size, device_index)
+
+    @property
+    def passes(self) -> int:
+        """How often a frame reads the points."""
+        return len(self._programs)
 
     def _prepare(self) -> None:
         context = self._context
         self._prepare_pieces()
         extensions, passes = (), ("PASS_DEPTH", "PASS_COLOUR")
-        if context.extensions.issuperset(_ATOMIC_INT64):
+        if not self._two_passes and context.extensions.issuperset(_ATOMIC_INT64):
             extensions, passes = _ATOMIC_INT64, ("PASS_WORD",)
         names = "columns", "points", "scatter.comp"
         self._programs = [

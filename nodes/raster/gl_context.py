@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 _LIBRARY = "libEGL.so.1"
 _VERSION = 450  # compute shaders came with 4.3; drivers take 64-bit atomics from GLSL 4.50 on
 _PROBE_S = 60
+_FREE_MEMORY_KIB = {"GL_NVX_gpu_memory_info": 0x9049, "GL_ATI_meminfo": 0x87FC}  # extension → what to query
 
 
 @cache
@@ -72,6 +73,21 @@ def storage_limit(context: moderngl.Context) -> int:
     """Bytes of the largest storage block. A driver whose limit overflows the query's 32 bits gets 2³¹ − 1."""
     limit = context.info["GL_MAX_SHADER_STORAGE_BLOCK_SIZE"]
     return limit if limit > 0 else 2**31 - 1
+
+
+def device_memory(context: moderngl.Context) -> int | None:
+    """Bytes of memory that are free on the device, None where the driver does not say."""
+    for extension, name in _FREE_MEMORY_KIB.items():
+        if extension in context.extensions:
+            library = ctypes.CDLL(_LIBRARY)
+            library.eglGetProcAddress.restype = ctypes.c_void_p
+            get_integers = ctypes.CFUNCTYPE(None, ctypes.c_uint, ctypes.c_void_p)(
+                library.eglGetProcAddress(b"glGetIntegerv")
+            )
+            free = (ctypes.c_int * 4)()
+            get_integers(name, free)
+            return free[0] << 10
+    return None
 
 
 def check_errors(context: moderngl.Context, doing: str) -> None:

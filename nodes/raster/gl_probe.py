@@ -1,4 +1,4 @@
-"""What the OpenGL device can do: transfers to and from it, and its multiply-adds."""
+"""What the OpenGL device can do: transfers to and from it, reading its memory, and its multiply-adds."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from .gl_context import check_errors, open_context, shader_source
+from .gl_context import check_errors, open_context, shader_source, storage_limit
 
 SIZES_BYTES = (4, 1 << 12, 1 << 16, 1 << 20, 1 << 24)
 _REPEATS = 15
+_READ_BYTES, _READ_GROUPS = 1 << 30, 4096
 _GROUPS, _GROUP_SIZE, _CHAINS, _ROUNDS = 512, 64, 4, 512
 
 
@@ -36,6 +37,31 @@ def transfer_times(device_index: int = 0) -> dict[str, list[float]]:
             buffer.release()
         check_errors(context, "measuring transfers")
         return times
+
+
+def read_bytes_per_s(device_index: int = 0) -> float:
+    """Bytes that a compute shader reads from device memory, from a buffer of 1 GiB or the storage-block limit.
+
+    Raises DeviceError as ``open_context`` does, or if there is not enough memory.
+    """
+    with open_context(device_index) as context:
+        n_bytes = min(_READ_BYTES, storage_limit(context)) // 16 * 16
+        buffer, out = context.buffer(reserve=n_bytes), context.buffer(reserve=4)
+        check_errors(context, f"allocating {n_bytes} bytes to read")
+        buffer.bind_to_storage_buffer(0)
+        out.bind_to_storage_buffer(1)
+        program = context.compute_shader(shader_source("read.comp"))
+        program["n_vectors"] = n_bytes // 16
+
+        def run() -> None:
+            program.run(_READ_GROUPS)
+            context.finish()
+
+        buffer.clear()  # memory that nothing has written may not be there
+        run()
+        seconds = _median_s(run)
+        check_errors(context, "measuring reads")
+    return n_bytes / seconds
 
 
 def flop_per_s(device_index: int = 0) -> float:
