@@ -156,7 +156,8 @@ def pixel_from_blocks(camera: Camera, block_origin: np.ndarray) -> np.ndarray:
     m = camera.pixel_from_world
     out = np.empty((len(block_origin), 3, 4))
     out[:, :, :3] = m[:, :3]
-    out[:, :, 3] = (block_origin - camera.eye) @ m[:, :3].T
+    x, y, z = (block_origin - camera.eye).T[:, :, None]
+    out[:, :, 3] = x * m[:, 0] + y * m[:, 1] + z * m[:, 2]  # in this order in the compiled kernels, too
     return out.astype(np.float32)
 
 

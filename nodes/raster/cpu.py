@@ -19,7 +19,8 @@ import numpy as np
 from ...shared.camera import Camera
 from ...shared.errors import InputError
 from ...shared.messages import FRAMEBUFFER_EMPTY
-from . import MAX_SIDE_PX, PointSize, ResidentPoints, check_viewport, pixel_from_blocks
+from . import MAX_SIDE_PX, PointSize, ResidentPoints, check_viewport, kernels
+from .blocks import Blocks, frustum
 from .pieces import split_entries
 
 PIECE_POINTS = 1 << 14
@@ -38,8 +39,12 @@ class CpuRasterizer:
     points : the render rank's half of a scene. Not modified, not copied if its arrays have the documented dtypes.
     width, height : viewport, 1…32768 px.
     threads : at most this many; None: all cores this process may run on.
-    Raises InputError if the viewport or the number of threads is out of range.
-    Memory: width · height · 8 bytes for the frame, as much again for each thread that a frame is worth.
+    compact : hold positions in fixed point (``compact``) instead of using those given. Needs finite positions; frames
+        are fastest, and as exact as there said, if blocks are single cells.
+    Raises InputError if the viewport or the number of threads is out of range, or if ``size`` is adaptive and the
+    points have no ``block_spacing``.
+    Memory: width · height · 8 bytes for the frame, as much again for each thread that a frame is worth; compact: 8
+    bytes a point.
     """
 
     name = "cpu"
@@ -60,16 +65,33 @@ class CpuRasterizer:
         if self._threads < 1:
             raise InputError(f"threads: found {threads}, expected at least 1")
         self.device = f"{self._threads} CPU thread" + "s" * (self._threads > 1)
-        self._size = size
-        self._x, self._y, self._z = map(_read_only, (points.x, points.y, points.z))
-        self._colour = _read_only(points.colour)
+        self._sides = size.pixels, max(size.pixels, size.maximum) if size.world or size.adaptive else size.pixels
+        self._n_points = len(points)
         self._block_first_point = np.asarray(points.block_first_point, np.int64)
-        self._block_origin = points.block_origin
-        self._rows = np.zeros((len(points.block_origin), 3, 4), np.float32)
+        none = np.empty((0, 3))
+        lower, step = none, none
+        columns = dict.fromkeys("xyz", np.empty(0, np.float32)) | dict.fromkeys(("high", "low"), np.empty(0, np.uint32))
+        if compact:
+            from .compact import compact_positions
+
+            positions = compact_positions(points, self._threads)
+            lower, step = positions.lower, positions.step
+            columns |= {"high": positions.high, "low": positions.low}
+        else:
+            columns |= {"x": points.x, "y": points.y, "z": points.z}
+        columns["colour"] = points.colour
+        self._points = kernels.Points(**{name: _read_only(column) for name, column in columns.items()})
+        self._blocks = Blocks(
+            np.ascontiguousarray(points.block_origin, np.float64), _world_sides(points, size), lower, step
+        )
+        pitch = kernels.pitch_of(width)
+        n_runs = height * pitch // kernels.RUN
         # one row a thread, followed by the word that points outside the image are sent to; memory is taken when used
-        self._framebuffers = np.empty((self._threads, width * height + 1), np.uint64)
+        self._framebuffers = np.empty((self._threads, height * pitch + 1), np.uint64)
+        self._dirty = np.zeros((self._threads, n_runs + 1), np.uint8)
         self._n_clean = 0
         self._frame = np.empty((height, width), np.uint64)
+        self._filled = np.ones(n_runs, np.uint8)
         self._executor = ThreadPoolExecutor(self._threads, "raster")
 
     def draw(self, camera: Camera, entries: np.ndarray) -> np.ndarray:
@@ -78,45 +100,48 @@ class CpuRasterizer:
         entries : (m,) RENDER_POINT.  Raises MessageError for an entry beyond the point-array or with stride 0, and
         for a camera of another viewport.
         """
-        from . import kernels
-
         height, width = self._frame.shape
         check_viewport(camera, width, height)
-        pieces = split_entries(entries, self._block_first_point, len(self._x), PIECE_POINTS)
-        used = np.flatnonzero(np.bincount(pieces["segment"], minlength=len(self._rows)))
-        self._rows[used] = pixel_from_blocks(camera, self._block_origin[used])
-        view = np.float32(camera.near), np.float32(width), np.float32(height)
-        size = _side_range(self._size, camera)
-
+        pieces = split_entries(entries, self._block_first_point, self._n_points, PIECE_POINTS)
+        seen, view = frustum(camera, self._sides[1] / 2 + 1), self._view(camera)
         framebuffers = self._clean_framebuffers(int(pieces["count"].sum(dtype=np.int64)))
+        dirty = self._dirty[: len(framebuffers)]
         turn = max(1, len(pieces) // (len(framebuffers) * TURNS_PER_THREAD))
         self._n_clean, n_clean = 0, max(self._n_clean, len(framebuffers))  # none, until the frame is complete
         counter = np.zeros(1, np.int64)
         self._run(
             len(framebuffers),
             lambda i: kernels.draw(
-                self._x, self._y, self._z, self._colour, pieces, self._rows, view, size, framebuffers[i], turn, counter
+                self._points, self._blocks, pieces, seen, view, framebuffers[i], dirty[i], turn, counter
             ),
         )
         counter = np.zeros(1, np.int64)
-        out = self._frame.reshape(-1)
         self._run(
-            min(self._threads, -(-len(out) // kernels.MERGE_RUN)),
-            lambda _: kernels.merge(framebuffers, out, counter),
+            min(self._threads, height),
+            lambda _: kernels.merge(framebuffers, dirty, self._frame, self._filled, counter),
         )
         self._n_clean = n_clean
         return self._frame
 
+    def _view(self, camera: Camera) -> kernels.View:
+        height, width = self._frame.shape
+        near, columns, rows, smallest, largest = map(np.float32, (camera.near, width, height, *self._sides))
+        pitch = np.int32(kernels.pitch_of(width))
+        return kernels.View(near, columns, rows, smallest, largest, pitch, self._sides == (1, 1))
+
     def _clean_framebuffers(self, n_points: int) -> np.ndarray:
-        """(t, width · height + 1) empty framebuffers, as many as make the frame shortest.
+        """(t, height · pitch + 1) empty framebuffers, as many as make the frame shortest.
 
         With t of them the threads draw n_points / t points each and merge t · pixels / threads words each.
         """
         best = math.sqrt(MERGED_PIXELS_PER_POINT * n_points * self._threads / self._frame.size)
-        framebuffers = self._framebuffers[: min(max(round(best), 1), self._threads)]
-        framebuffers[self._n_clean :, :-1] = FRAMEBUFFER_EMPTY
-        framebuffers[self._n_clean :, -1] = 0
-        return framebuffers
+        n = min(max(round(best), 1), self._threads)
+        if n > self._n_clean:
+            self._framebuffers[self._n_clean : n, :-1] = FRAMEBUFFER_EMPTY
+            self._framebuffers[self._n_clean : n, -1] = 0
+            self._dirty[self._n_clean : n] = 0
+            self._filled[:] = 1  # whatever a frame that failed left in the picture
+        return self._framebuffers[:n]
 
     def _run(self, n: int, work: Callable[[int], None]) -> None:
         """Call ``work(0)`` … ``work(n − 1)``, each on its own thread."""
@@ -134,10 +159,13 @@ class CpuRasterizer:
         self.close()
 
 
-def _side_range(size: PointSize, camera: Camera) -> tuple[np.float32, np.float32, np.float32]:
-    """Smallest side, side at depth 1 (0: the smallest always), largest side."""
-    largest = max(size.pixels, size.maximum)
-    return np.float32(size.pixels), np.float32(size.world * camera.focal_px), np.float32(largest)
+def _world_sides(points: ResidentPoints, size: PointSize) -> np.ndarray:
+    """(b,) float64: side of a point's square in each block, world units; 0: the smallest."""
+    if not size.adaptive:
+        return np.full(len(points.block_origin), size.world)
+    if points.block_spacing is None:
+        raise InputError("point size: found no spacing of the points of each block, expected it for adaptive sizes")
+    return np.maximum(points.block_spacing.astype(np.float64), size.world)
 
 
 def _read_only(column: np.ndarray) -> np.ndarray:
@@ -155,7 +183,7 @@ def kernels_cached() -> bool:
 
     True if the compiled files are younger than the source, as far as numba's cache folder tells.
     """
-    from . import kernels, pieces
+    from . import pieces
 
     def cached(kernel: Any) -> bool:
         folder, source = Path(kernel.stats.cache_path), Path(kernel.py_func.__code__.co_filename)

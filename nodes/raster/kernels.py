@@ -1,9 +1,14 @@
 """Compiled kernels of the ``cpu`` rasterizer: project points, take the minimum into a framebuffer, merge framebuffers.
 
-Points go through two loops, ``BATCH`` at a time. The first projects into small arrays that stay in the first-level
-cache; it has no branch and no shared state, so the compiler vectorises it. The second takes the minimum into the
-framebuffer, and stores it always instead of only where a point is nearer: that branch is mispredicted so often that
-skipping the store costs more than it saves (measured: 1.3 to 2 times the frame time on a closed surface).
+Points go through short loops, ``BATCH`` at a time, over small arrays that stay in the first-level cache: decode (of
+fixed point only), project, pack words, take minima. All but the last have no branch and no shared state, so the
+compiler vectorises them; the last has nothing in it but the load, minimum and store of a word, so that as many cache
+misses as the core can have are under way at once. It stores always instead of only where a point is nearer: that
+branch is mispredicted so often that skipping the store costs more than it saves (measured: 1.3 to 2 times the frame
+time on a closed surface).
+
+A framebuffer notes which runs of ``RUN`` words were drawn to. Only those are merged and emptied, so a frame costs what
+its picture covers and not what the image holds.
 
 Every step is one float32 operation in a fixed order (no fast-math), so a point has the same pixel and depth wherever
 it stands in an array and whichever thread draws it. In the loops arrays are indexed, not sliced or viewed: numba
@@ -12,7 +17,7 @@ counts references to slices and views atomically, in a cache line that all threa
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit, types
@@ -20,16 +25,57 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from ...shared.messages import FRAMEBUFFER_EMPTY
+from .blocks import FLOAT32, FULL, HIGH, OUTSIDE, block_rows
 
-BATCH = 256
-"""Points projected at a time: few enough for the first-level cache, enough to amortise the calls."""
+BATCH = 1024
+"""Points drawn at a time: their 28 KiB of scratch fit the first-level cache; long loops keep more misses under way."""
 
-MERGE_RUN = 4096
-"""Framebuffer words a thread merges at a time: 32 KiB."""
+RUN = 64
+"""Framebuffer words that are drawn to, or not, as one: 512 bytes of a row."""
 
+RUN_SHIFT = np.uintp(6)
 _EMPTY = np.uint64(FRAMEBUFFER_EMPTY)
 _FLOAT_MAX = np.float32(np.finfo(np.float32).max)
 _ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
+_TEN_BITS = np.uint32(1023)
+
+
+class Points(NamedTuple):
+    """Columns of the point-array; those that no segment is read from are empty.
+
+    x, y, z : (n,) float32.  high, low : (n,) uint32, see ``compact``.  colour : (n,) uint32.
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    z: np.ndarray
+    high: np.ndarray
+    low: np.ndarray
+    colour: np.ndarray
+
+
+class View(NamedTuple):
+    """near, width, height, smallest and largest side of a point's square (px) as float32; words of a framebuffer row.
+
+    one_pixel : every square is one pixel.
+    """
+
+    near: np.float32
+    width: np.float32
+    height: np.float32
+    smallest: np.float32
+    largest: np.float32
+    pitch: np.int32
+    one_pixel: bool
+
+
+def pitch_of(width: int) -> int:
+    """Words from one framebuffer row to the next: whole runs, and an odd number of them.
+
+    Rows a multiple of 4 KiB apart would share sets of the first-level cache and look alike to the store buffer
+    (measured at 1024 columns: 1.2 to 1.5 times the time of drawing).
+    """
+    return (-(-width // RUN) | 1) * RUN
 
 
 def _fetch_add_intrinsic(_context: Any, counter: Any, amount: Any) -> Any:
@@ -46,82 +92,116 @@ _fetch_add: Any = intrinsic(_fetch_add_intrinsic)
 
 
 @njit(nogil=True, cache=True)
-def draw(x, y, z, colour, pieces, rows, view, size, words, turn, counter):
+def draw(points, blocks, pieces, frustum, view, words, dirty, turn, counter):
     """Draw pieces into one framebuffer until none is left.
 
-    x, y, z : (n,) float32.  colour : (n,) uint32.
-    pieces : (p,) PIECE.  rows : (s, 3, 4) float32, pixel from block, by segment.
-    view : near, width, height as float32.
-    size : smallest side, side at depth 1, largest side of a point's square as float32, px.
-    words : (width · height + 1,) uint64. The last word is 0: points outside the image go there, and never win.
+    points : Points.  blocks : Blocks.  pieces : (p,) PIECE, segments being blocks.  frustum : Frustum.  view : View.
+    words : (height · pitch + 1,) uint64. The last word is 0: points outside the image go there, and never win.
+    dirty : (height · pitch / RUN + 1,) uint8, set to 1 for runs that are drawn to.
     turn : pieces taken at a time.  counter : (1,) int64, shared by the threads of a frame, 0 at its start.
     """
-    one_pixel = size[0] == _ONE and size[1] == _ZERO
-    place, depth = np.empty(3 * BATCH, np.int32), np.empty(BATCH, np.float32)
-    gx, gy, gz = np.empty(BATCH, np.float32), np.empty(BATCH, np.float32), np.empty(BATCH, np.float32)
-    gcolour = np.empty(BATCH, np.uint32)
+    place, depth, packed = np.empty(3 * BATCH, np.int32), np.empty(BATCH, np.float32), np.empty(BATCH, np.uint64)
+    x, y, z = np.empty(BATCH, np.float32), np.empty(BATCH, np.float32), np.empty(BATCH, np.float32)
+    high, low = np.empty(BATCH, np.uint32), np.empty(BATCH, np.uint32)
+    colour = np.empty(BATCH, np.uint32)
+    rows = np.empty((3, 4), np.float32)
     begin = _fetch_add(counter, turn)
     while begin < len(pieces):
         for k in range(begin, min(begin + turn, len(pieces))):
             s, stride = np.uintp(pieces[k].segment), np.int64(pieces[k].stride)
+            precision = block_rows(blocks, s, frustum, rows)
+            if precision == OUTSIDE:
+                continue
+            side_at_one = np.float32(blocks.world_side[s] * frustum.focal_px)
             for done in range(0, pieces[k].count, BATCH):
                 n = min(BATCH, pieces[k].count - done)
                 first = pieces[k].first + done * stride
-                if stride == 1:
-                    if one_pixel:
-                        _draw_pixels(x, y, z, colour, first, n, rows, s, view, words, place, depth)
-                    else:
-                        _draw_squares(x, y, z, colour, first, n, rows, s, view, size, words, place, depth)
-                else:  # gathered first, so that every stride is projected by the same loop
+                if stride == 1 and precision == FLOAT32:
+                    _project(points.x, points.y, points.z, first, n, rows, side_at_one, view, len(words), place, depth)
+                elif stride == 1:
+                    _decode(points.high, points.low, first, n, precision, x, y, z)
+                    _project(x, y, z, 0, n, rows, side_at_one, view, len(words), place, depth)
+                else:  # gathered first, so that every stride goes through the same loops
                     for i in range(n):
                         j = first + i * stride
-                        gx[i], gy[i], gz[i], gcolour[i] = x[j], y[j], z[j], colour[j]
-                    if one_pixel:
-                        _draw_pixels(gx, gy, gz, gcolour, 0, n, rows, s, view, words, place, depth)
-                    else:
-                        _draw_squares(gx, gy, gz, gcolour, 0, n, rows, s, view, size, words, place, depth)
+                        colour[i] = points.colour[j]
+                        if precision == FLOAT32:
+                            x[i], y[i], z[i] = points.x[j], points.y[j], points.z[j]
+                        else:
+                            high[i] = points.high[j]
+                            low[i] = points.low[j] if precision == FULL else np.uint32(0)
+                    if precision != FLOAT32:
+                        _decode(high, low, 0, n, precision, x, y, z)
+                    _project(x, y, z, 0, n, rows, side_at_one, view, len(words), place, depth)
+                if stride == 1:
+                    _pack(depth, points.colour, first, n, packed)
+                else:
+                    _pack(depth, colour, 0, n, packed)
+                if view.one_pixel:
+                    _take_pixels(place, packed, n, words, dirty)
+                else:
+                    _take_squares(place, packed, n, view, words, dirty)
         begin = _fetch_add(counter, turn)
 
 
+@njit(nogil=True, cache=True)
+def _decode(high, low, first, n, precision, x, y, z):
+    """Bins of ``n`` points from ``first`` on, as float32: exact, at most 20 bits."""
+    if precision == HIGH:
+        for i in range(n):
+            h = high[np.uintp(first) + np.uintp(i)]
+            x[i] = np.float32(np.int32(h & _TEN_BITS))
+            y[i] = np.float32(np.int32((h >> np.uint32(10)) & _TEN_BITS))
+            z[i] = np.float32(np.int32((h >> np.uint32(20)) & _TEN_BITS))
+    else:
+        for i in range(n):
+            h, w = high[np.uintp(first) + np.uintp(i)], low[np.uintp(first) + np.uintp(i)]
+            x[i] = np.float32(np.int32((h & _TEN_BITS) << np.uint32(10) | (w & _TEN_BITS)))
+            h, w = h >> np.uint32(10), w >> np.uint32(10)
+            y[i] = np.float32(np.int32((h & _TEN_BITS) << np.uint32(10) | (w & _TEN_BITS)))
+            h, w = h >> np.uint32(10), w >> np.uint32(10)
+            z[i] = np.float32(np.int32((h & _TEN_BITS) << np.uint32(10) | (w & _TEN_BITS)))
+
+
+@njit(nogil=True, cache=True)
+def _project(x, y, z, first, n, rows, side_at_one, view, n_words, place, depth):
+    """Places and depths of ``n`` ≤ BATCH points from ``first`` on."""
+    if view.one_pixel:
+        _project_pixels(x, y, z, first, n, rows, view, np.int32(n_words - 1), place, depth)
+    else:
+        _project_squares(x, y, z, first, n, rows, side_at_one, view, place, depth)
+
+
 @njit(nogil=True, cache=True, error_model="numpy")
-def _project(rows, s, x, y, z):
+def _image_position(rows, x, y, z):
     """Image position and depth of one point: (u, v) in pixels, w."""
-    w = rows[s, 2, 0] * x + rows[s, 2, 1] * y + rows[s, 2, 2] * z + rows[s, 2, 3]
-    u = (rows[s, 0, 0] * x + rows[s, 0, 1] * y + rows[s, 0, 2] * z + rows[s, 0, 3]) / w
-    v = (rows[s, 1, 0] * x + rows[s, 1, 1] * y + rows[s, 1, 2] * z + rows[s, 1, 3]) / w
+    w = rows[2, 0] * x + rows[2, 1] * y + rows[2, 2] * z + rows[2, 3]
+    u = (rows[0, 0] * x + rows[0, 1] * y + rows[0, 2] * z + rows[0, 3]) / w
+    v = (rows[1, 0] * x + rows[1, 1] * y + rows[1, 2] * z + rows[1, 3]) / w
     return u, v, w
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _draw_pixels(x, y, z, colour, first, n, rows, s, view, words, place, depth):
-    """Draw ``n`` ≤ BATCH points from ``first`` on as one pixel each; ``place`` and ``depth`` are scratch."""
-    near, width, height = view
-    outside = np.int32(len(words) - 1)
+def _project_pixels(x, y, z, first, n, rows, view, outside, place, depth):
+    """``place``: index of the word of each point's pixel; ``outside`` for a point that has none."""
+    near, width, height, pitch = view.near, view.width, view.height, view.pitch
     for i in range(n):
         j = np.uintp(first) + np.uintp(i)
-        u, v, w = _project(rows, s, x[j], y[j], z[j])
+        u, v, w = _image_position(rows, x[j], y[j], z[j])
         inside = (w >= near) & (w <= _FLOAT_MAX) & (u >= _ZERO) & (u < width) & (v >= _ZERO) & (v < height)
         # a NaN or a value beyond int32 must not reach the conversions
         column, row = np.int32(u if inside else _ZERO), np.int32(v if inside else _ZERO)
-        place[i] = row * np.int32(width) + column if inside else outside
+        place[i] = row * pitch + column if inside else outside
         depth[i] = w
-    depth_bits = depth.view(np.uint32)
-    for i in range(n):
-        p = np.uintp(place[i])
-        words[p] = min(words[p], _word(depth_bits[i], colour[np.uintp(first) + np.uintp(i)]))
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _draw_squares(x, y, z, colour, first, n, rows, s, view, size, words, place, depth):
-    """Draw ``n`` ≤ BATCH points from ``first`` on as squares; ``place`` and ``depth`` are scratch.
-
-    ``place`` holds first columns, then first rows, then sides (0 for a point outside the image).
-    """
-    near, width, height = view
-    smallest, side_at_one, largest = size
+def _project_squares(x, y, z, first, n, rows, side_at_one, view, place, depth):
+    """``place``: first columns, then first rows, then sides (0 for a point outside the image)."""
+    near, width, height, smallest, largest = view.near, view.width, view.height, view.smallest, view.largest
     for i in range(n):
         j = np.uintp(first) + np.uintp(i)
-        u, v, w = _project(rows, s, x[j], y[j], z[j])
+        u, v, w = _image_position(rows, x[j], y[j], z[j])
         side = side_at_one / w
         side = side if side > smallest else smallest  # also for NaN
         side = side if side < largest else largest
@@ -135,15 +215,6 @@ def _draw_squares(x, y, z, colour, first, n, rows, s, view, size, words, place, 
         place[BATCH + i] = _floor(v if inside else _ZERO)
         place[2 * BATCH + i] = whole_side if inside else np.int32(0)
         depth[i] = w
-    depth_bits = depth.view(np.uint32)
-    stride = np.int64(width)
-    for i in range(n):
-        word = _word(depth_bits[i], colour[np.uintp(first) + np.uintp(i)])
-        side = place[2 * BATCH + i]
-        for row in range(max(place[BATCH + i], 0), min(place[BATCH + i] + side, np.int64(height))):
-            for column in range(max(place[i], 0), min(place[i] + side, stride)):
-                p = np.uintp(row * stride + column)
-                words[p] = min(words[p], word)
 
 
 @njit(nogil=True, cache=True)
@@ -154,25 +225,59 @@ def _floor(x):
 
 
 @njit(nogil=True, cache=True)
-def _word(depth_bits, colour):
-    """Framebuffer word of two uint32."""
-    return np.uint64(depth_bits) << np.uint64(32) | np.uint64(colour)
+def _pack(depth, colour, first, n, packed):
+    """Framebuffer words of ``n`` depths and of the colours from ``first`` on."""
+    bits = depth.view(np.uint32)
+    for i in range(n):
+        packed[i] = np.uint64(bits[i]) << np.uint64(32) | np.uint64(colour[np.uintp(first) + np.uintp(i)])
 
 
 @njit(nogil=True, cache=True)
-def merge(framebuffers, out, counter):
-    """Minimum over framebuffers, which are left empty for the next frame, until no run of words is left.
+def _take_pixels(place, packed, n, words, dirty):
+    for i in range(n):
+        p = np.uintp(place[i])
+        words[p] = min(words[p], packed[i])
+        dirty[p >> RUN_SHIFT] = 1
 
-    framebuffers : (t, n + 1) uint64.  out : (n,) uint64.  counter : as in ``draw``.
+
+@njit(nogil=True, cache=True)
+def _take_squares(place, packed, n, view, words, dirty):
+    width, height, pitch = np.int64(view.width), np.int64(view.height), np.int64(view.pitch)
+    for i in range(n):
+        word, side = packed[i], place[2 * BATCH + i]
+        begin, end = max(place[i], 0), min(place[i] + side, width)
+        for row in range(max(place[BATCH + i], 0), min(place[BATCH + i] + side, height)):
+            for p in range(row * pitch + begin, row * pitch + end):
+                words[p] = min(words[p], word)
+                dirty[np.uintp(p) >> RUN_SHIFT] = 1
+
+
+@njit(nogil=True, cache=True)
+def merge(framebuffers, dirty, frame, filled, counter):
+    """Minimum over framebuffers, which are left empty and clean for the next frame, until no row of the frame is left.
+
+    framebuffers : (t, height · pitch + 1) uint64.  dirty : (t, height · pitch / RUN + 1) uint8, as ``draw`` left it.
+    frame : (height, width) uint64.  filled : (height · pitch / RUN,) uint8, runs of the frame that are not empty; both
+    as the last frame left them.  counter : as in ``draw``.
     """
-    begin = _fetch_add(counter, MERGE_RUN)
-    while begin < len(out):
-        end = min(begin + MERGE_RUN, len(out))
-        for i in range(begin, end):
-            out[i] = framebuffers[0, i]
-            framebuffers[0, i] = _EMPTY
-        for t in range(1, len(framebuffers)):
-            for i in range(begin, end):
-                out[i] = min(out[i], framebuffers[t, i])
-                framebuffers[t, i] = _EMPTY
-        begin = _fetch_add(counter, MERGE_RUN)
+    height, width = frame.shape
+    pitch = (framebuffers.shape[1] - 1) // height
+    row = _fetch_add(counter, 1)
+    while row < height:
+        for begin in range(0, width, RUN):
+            end = min(begin + RUN, width)
+            run, shift = (row * pitch + begin) // RUN, row * pitch
+            drawn = False
+            for t in range(len(framebuffers)):
+                if dirty[t, run]:
+                    dirty[t, run] = 0
+                    for c in range(begin, end):
+                        word = framebuffers[t, shift + c]
+                        framebuffers[t, shift + c] = _EMPTY
+                        frame[row, c] = min(frame[row, c], word) if drawn else word
+                    drawn = True
+            if filled[run] and not drawn:
+                for c in range(begin, end):
+                    frame[row, c] = _EMPTY
+            filled[run] = drawn
+        row = _fetch_add(counter, 1)

@@ -48,12 +48,15 @@ def _split(
     offset: np.ndarray, length: np.ndarray, stride: np.ndarray, borders: np.ndarray, limit: int, out: np.ndarray
 ) -> int:
     """Number of pieces; written to ``out`` unless that is empty. ``borders``: end of each segment."""
-    n = 0
+    n, segment = 0, 0
     for i in range(len(offset)):
         first, step = offset[i], np.int64(stride[i])
         end = first + length[i]
         while first < end:
-            segment = np.searchsorted(borders, first, side="right")
+            # most often the segment of the last piece or the one after it
+            segment = min(segment + (first >= borders[segment]), len(borders) - 1)
+            if first >= borders[segment] or (segment > 0 and first < borders[segment - 1]):
+                segment = np.searchsorted(borders, first, side="right")
             count = min((min(end, borders[segment]) - first + step - 1) // step, limit)
             if len(out):
                 out[n].first, out[n].count, out[n].stride, out[n].segment = first, count, stride[i], segment
