@@ -8,6 +8,12 @@ inside each codec's own module.
 module                  source
 ======================  ==================================================================================
 ``grid``                positions ↔ grid points, and the order of points that codecs change
+``order``               keys, and the stable sort by them
+``varints``             whole numbers in few bytes
+``container``           what stands before a bit stream: number of points, repeats, blocks that hold some
+``ci``                  Mallón et al., "Algorithms and Hardware for Data Compression in Point Rendering", 3.1
+``eci``                 the same, 3.2: layers of neighbours
+``ci_reference`` …      the paper's two in plain form, bit by bit
 ======================  ==================================================================================
 
 Data that comes from a file or a socket is never believed: decoders raise ``CodecError`` on anything that no encoder
