@@ -21,7 +21,15 @@ AVAILABLE, REASON = gl_available()
 
 WIDTH, HEIGHT = 160, 100
 N_POINTS = 40_000
-SIZES = [PointSize(), PointSize(3), PointSize(4), PointSize(1, world=0.05, maximum=9)]
+SIZES = [
+    PointSize(),
+    PointSize(3),
+    PointSize(4),
+    PointSize(1, world=0.05, maximum=9),
+    PointSize(1, adaptive=True),
+    PointSize(2, world=0.03, maximum=9, adaptive=True),
+]
+SPACING = np.array([0.1, 0.01, 0.05, 0.02, 0.0, 0.04, 0.2], np.float32)
 BOTH = pytest.mark.parametrize("rasterizer", [GlComputeRasterizer, GlPointsRasterizer])
 BORDER_PX = 0.001
 """A point nearer than this to a pixel border may be rounded to either side."""
@@ -41,7 +49,8 @@ def points() -> ResidentPoints:
     first = np.array([0, 1, 5003, 5003, 17_777, 30_011, 39_999])
     origin = rng.uniform(-2, 2, (len(first), 3))
     x, y, z = np.ascontiguousarray((world - np.repeat(origin, np.diff(first, append=N_POINTS), axis=0)).T, np.float32)
-    return ResidentPoints(x, y, z, rng.integers(0, 2**32, N_POINTS, np.uint32), first, origin)
+    colour = rng.integers(0, 2**32, N_POINTS, np.uint32)
+    return ResidentPoints(x, y, z, colour, first, origin, block_spacing=SPACING)
 
 
 ALL = np.array([(0, N_POINTS, 1)], RENDER_POINT)
@@ -58,7 +67,10 @@ def depths(frame: np.ndarray) -> np.ndarray:
 def pixels_near_borders(points: ResidentPoints, size: PointSize) -> np.ndarray:
     """(HEIGHT, WIDTH) bool: pixels that some square may or may not cover, by its position or its size."""
     u, v, w = project(points, camera(), np.arange(len(points)))
-    side = np.clip(size.world * camera().focal_px / w, size.pixels, max(size.pixels, size.maximum))
+    world = np.full(len(SPACING), size.world)
+    world = np.maximum(world, SPACING) if size.adaptive else world
+    world = np.repeat(world, np.diff(points.block_first_point, append=N_POINTS))
+    side = np.clip(world * camera().focal_px / w, size.pixels, max(size.pixels, size.maximum))
     whole = np.floor(side + 0.5)
     corner = np.stack([u, v]) - 0.5 * (whole - 1)
     near = (np.abs(corner - np.rint(corner)) < BORDER_PX).any(axis=0) | (
@@ -202,6 +214,11 @@ class TestOnDevice:
                     ours.draw(camera(), np.array([bad], RENDER_POINT))
             with pytest.raises(MessageError, match="viewport: found 7×100"):
                 ours.draw(replace(camera(), width=7), ALL)
+
+    @BOTH
+    def test_adaptive_sizes_need_spacings(self, points, rasterizer):
+        with pytest.raises(InputError, match="found no spacing of the points of each block"):
+            rasterizer(replace(points, block_spacing=None), WIDTH, HEIGHT, PointSize(adaptive=True))
 
     @BOTH
     def test_a_bad_viewport_is_refused(self, points, rasterizer):

@@ -161,6 +161,18 @@ def pixel_from_blocks(camera: Camera, block_origin: np.ndarray) -> np.ndarray:
     return out.astype(np.float32)
 
 
+def world_sides(points: ResidentPoints, size: PointSize) -> np.ndarray:
+    """(b,) float64: side of a point's square in each block, world units; 0: the smallest.
+
+    Raises InputError if sizes are adaptive and nobody knows the spacing of the points.
+    """
+    if not size.adaptive:
+        return np.full(len(points.block_origin), size.world)
+    if points.block_spacing is None:
+        raise InputError("point size: found no spacing of the points of each block, expected it for adaptive sizes")
+    return np.maximum(points.block_spacing.astype(np.float64), size.world)
+
+
 def check_viewport(camera: Camera, width: int, height: int) -> None:
     """Raise MessageError for a camera of another viewport than the rasterizer was made for."""
     if (camera.width, camera.height) != (width, height):

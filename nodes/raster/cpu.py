@@ -19,7 +19,7 @@ import numpy as np
 from ...shared.camera import Camera
 from ...shared.errors import InputError
 from ...shared.messages import FRAMEBUFFER_EMPTY
-from . import MAX_SIDE_PX, PointSize, ResidentPoints, check_viewport, kernels
+from . import MAX_SIDE_PX, PointSize, ResidentPoints, check_viewport, kernels, world_sides
 from .blocks import Blocks, frustum
 from .pieces import split_entries
 
@@ -82,7 +82,7 @@ class CpuRasterizer:
         columns["colour"] = points.colour
         self._points = kernels.Points(**{name: _read_only(column) for name, column in columns.items()})
         self._blocks = Blocks(
-            np.ascontiguousarray(points.block_origin, np.float64), _world_sides(points, size), lower, step
+            np.ascontiguousarray(points.block_origin, np.float64), world_sides(points, size), lower, step
         )
         pitch = kernels.pitch_of(width)
         n_runs = height * pitch // kernels.RUN
@@ -108,11 +108,11 @@ class CpuRasterizer:
         dirty = self._dirty[: len(framebuffers)]
         turn = max(1, len(pieces) // (len(framebuffers) * TURNS_PER_THREAD))
         self._n_clean, n_clean = 0, max(self._n_clean, len(framebuffers))  # none, until the frame is complete
-        counter = np.zeros(1, np.int64)
+        taken = len(pieces) * np.arange(len(framebuffers)) // len(framebuffers)
         self._run(
             len(framebuffers),
             lambda i: kernels.draw(
-                self._points, self._blocks, pieces, seen, view, framebuffers[i], dirty[i], turn, counter
+                self._points, self._blocks, pieces, seen, view, framebuffers[i], dirty[i], i, turn, taken
             ),
         )
         counter = np.zeros(1, np.int64)
@@ -157,15 +157,6 @@ class CpuRasterizer:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def _world_sides(points: ResidentPoints, size: PointSize) -> np.ndarray:
-    """(b,) float64: side of a point's square in each block, world units; 0: the smallest."""
-    if not size.adaptive:
-        return np.full(len(points.block_origin), size.world)
-    if points.block_spacing is None:
-        raise InputError("point size: found no spacing of the points of each block, expected it for adaptive sizes")
-    return np.maximum(points.block_spacing.astype(np.float64), size.world)
 
 
 def _read_only(column: np.ndarray) -> np.ndarray:

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...shared.camera import Camera
-from ...shared.errors import DeviceError, InputError
+from ...shared.errors import DeviceError
 from ...shared.messages import FRAMEBUFFER_EMPTY
-from . import PointSize, ResidentPoints, pixel_from_blocks
+from . import PointSize, ResidentPoints, pixel_from_blocks, world_sides
 from .gl_context import shader_source
 from .gl_resident import Batch, GlResident
 
@@ -50,11 +50,7 @@ class _GlPointRasterizer(GlResident):
     ) -> None:
         self._unit_points, self._batch_units = _PIECE_POINTS, _BATCH_PIECES
         self._size = size
-        self._world = np.full(len(points.block_origin), size.world)  # side of each block's points, world units
-        if size.adaptive:
-            if points.block_spacing is None:
-                raise InputError("point size: adaptive, found blocks without spacings, expected one for each block")
-            self._world = np.maximum(self._world, points.block_spacing.astype(np.float64))
+        self._world = world_sides(points, size)
         super().__init__(points, (points.x, points.y, points.z, points.colour), width, height, device_index)
 
     def _prepare_pieces(self, *defines: str) -> None:

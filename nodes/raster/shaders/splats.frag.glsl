@@ -1,7 +1,7 @@
 // A fragment of a splat. PASS_VISIBILITY: its depth, the least of which stays by blending.
 // PASS_COLOUR: weighted colour and weight, added up; the least depth, if it is not behind the visible surface.
 
-flat in vec4 centre;  // place, depth, radius
+flat in vec4 place_w_radius;
 flat in vec2 gradient;
 #ifdef PASS_COLOUR
 flat in vec3 rgb;
@@ -16,11 +16,11 @@ layout(location = 0) out float front;
 uniform float screen_radius_px;
 
 void main() {
-    vec2 delta = gl_FragCoord.xy - centre.xy;
-    float w = centre.z, radius = centre.w;
+    vec2 delta = gl_FragCoord.xy - place_w_radius.xy;
+    float w = place_w_radius.z, radius = place_w_radius.w;
     precise float slope = gradient.x * delta.x + gradient.y * delta.y;
     precise float t = w / (1.0 + slope);  // where the ray meets the plane
-    vec3 p = vec3((centre.xy - center) / focal * w, w);
+    vec3 p = vec3((place_w_radius.xy - center) / focal * w, w);
     precise vec3 off = (vec3(t * delta / focal, 0.0) - p * (slope / (1.0 + slope))) / radius;
     precise float disc = off.x * off.x + off.y * off.y + off.z * off.z;
     precise vec2 close = delta / screen_radius_px;

@@ -2,7 +2,7 @@
 // driver's point size (255 px on llvmpipe) and vanish with their centres.
 
 layout(std430, binding = 8) restrict readonly buffer Splats { Splat splats[]; };
-flat out vec4 centre;  // place, depth, radius
+flat out vec4 place_w_radius;
 flat out vec2 gradient;
 #ifdef PASS_COLOUR
 flat out vec3 rgb;
@@ -16,7 +16,7 @@ void main() {
 #else
     bool drawn = s.reach != 0u && s.radius > 0.0;
 #endif
-    centre = vec4(s.place, s.w, abs(s.radius));
+    place_w_radius = vec4(s.place, s.w, abs(s.radius));
     gradient = s.gradient;
     vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0 - 1.0;
     vec2 pixel = s.place + corner * unpackHalf2x16(s.reach);
