@@ -108,11 +108,11 @@ class CpuRasterizer:
         dirty = self._dirty[: len(framebuffers)]
         turn = max(1, len(pieces) // (len(framebuffers) * TURNS_PER_THREAD))
         self._n_clean, n_clean = 0, max(self._n_clean, len(framebuffers))  # none, until the frame is complete
-        taken = len(pieces) * np.arange(len(framebuffers)) // len(framebuffers)
+        counter = np.zeros(1, np.int64)
         self._run(
             len(framebuffers),
             lambda i: kernels.draw(
-                self._points, self._blocks, pieces, seen, view, framebuffers[i], dirty[i], i, turn, taken
+                self._points, self._blocks, pieces, seen, view, framebuffers[i], dirty[i], turn, counter
             ),
         )
         counter = np.zeros(1, np.int64)
