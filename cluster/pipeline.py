@@ -11,19 +11,15 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-
 from ..shared.messages import (
     RENDER_POINT,
     Kind,
-    RenderPoints,
-    VisibilityBits,
     decode_camera,
     decode_render_points,
     decode_visibility,
 )
 from .job import Job
-from .record import StageClock, rank_record, spread_ms
+from .record import FrameCounts, StageClock, rank_record, spread_ms
 from .transport import Transport
 
 CULLING, SAMPLING, RENDER = range(3)
@@ -170,27 +166,6 @@ def _render(job: Job, transport: Transport) -> None:
     statistics["per_frame"] |= render.times()
     statistics["rasterizer"] = render.description
     transport.send_note(CULLING, Kind.STATISTICS, job.n_frames, statistics)
-
-
-class FrameCounts:
-    """How much of everything each frame had: cells that may be seen, render-points entries, points drawn."""
-
-    def __init__(self) -> None:
-        self._lists: dict[str, list[int]] = {}
-
-    def add(self, *messages: VisibilityBits | RenderPoints) -> None:
-        """Count a frame's messages. Outside the stage clocks: it is no work of the pipeline."""
-        for message in messages:
-            if isinstance(message, VisibilityBits):
-                found = {"cells_visible": int(np.bitwise_count(message.bits).sum())}
-            else:
-                found = {"entries": len(message.entries), "points": message.n_points}
-            for name, count in found.items():
-                self._lists.setdefault(name, []).append(count)
-
-    def lists(self) -> dict[str, list[int]]:
-        """Name → one count a frame."""
-        return self._lists
 
 
 def _statistics(transport: Transport, clock: StageClock, counts: FrameCounts) -> dict[str, Any]:

@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from ..shared.messages import RenderPoints, VisibilityBits
+
 RECORD_VERSION = 1
 
 
@@ -43,6 +45,27 @@ class StageClock:
     def summary(self) -> dict[str, Any]:
         """Median, spread and sum of the work in milliseconds; the sum of waiting in seconds."""
         return {"work_ms": spread_ms(self.work_s), "work_s": sum(self.work_s), "wait_s": sum(self.wait_s)}
+
+
+class FrameCounts:
+    """How much of everything each frame had: cells that may be seen, render-points entries, points drawn."""
+
+    def __init__(self) -> None:
+        self._lists: dict[str, list[int]] = {}
+
+    def add(self, *messages: VisibilityBits | RenderPoints) -> None:
+        """Count a frame's messages. Outside the stage clocks: it is no work of the pipeline."""
+        for message in messages:
+            if isinstance(message, VisibilityBits):
+                found = {"cells_visible": int(np.bitwise_count(message.bits).sum())}
+            else:
+                found = {"entries": len(message.entries), "points": message.n_points}
+            for name, count in found.items():
+                self._lists.setdefault(name, []).append(count)
+
+    def lists(self) -> dict[str, list[int]]:
+        """Name → one count a frame."""
+        return self._lists
 
 
 def spread_ms(seconds: list[float]) -> dict[str, float]:

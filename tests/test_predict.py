@@ -22,6 +22,7 @@ from splatpipe.cluster.predict.workload import COLD_POINTS, Workload, count_work
 from splatpipe.shared.build import BuildSettings, build_scene
 from splatpipe.shared.config import RunConfig, load_config, parse_config
 from splatpipe.shared.errors import ConfigError, InputError
+from splatpipe.shared.rebuild import leaf_ranges
 from splatpipe.shared.synth import CityScan
 
 
@@ -324,6 +325,19 @@ def test_covered_pixels_are_what_the_points_write(config):
     near = count_workload(Job(load_config(config, ["render.point_size_world=5.0"])))
     wide = count_workload(Job(load_config(config, ["render.point_size_world=20.0"])))
     assert (wide.covered > near.covered).all()
+
+
+def test_adaptive_points_cover_what_the_spacing_of_their_cells_says(config):
+    job = Job(load_config(config, ["render.point_size_adaptive=true", "sampling.pixel_threshold=0"]))
+    load, points, camera = count_workload(job), job.load_points(verify=False), job.camera(0)
+    index = np.concatenate([np.arange(first, end) for first, end in leaf_ranges(job.scene)])
+    block = np.searchsorted(points.block_first_point, index, side="right") - 1
+    relative = np.column_stack([column[index] for column in (points.x, points.y, points.z)])
+    depth = (points.block_origin[block] + relative - camera.eye) @ camera.pixel_from_world[2, :3]
+    side = np.rint(np.clip(points.block_spacing[block] * camera.focal_px / depth, 1, 64))
+    assert load.points[0] == len(index), "everything is in the picture"
+    assert load.covered[0] == pytest.approx((side**2).sum(), rel=0.1)
+    assert load.covered[0] > 1.05 * load.points[0]
 
 
 def test_calibration_never_has_the_settings_it_is_used_for():

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ..job import Job
+from ..record import FrameCounts
 
 LOOK_FRAMES = 5
 LOOK_REPEATS = 3
@@ -44,15 +45,16 @@ class Workload:
         octree = job.scene.octree()
         culling, sampling = job.culling_node(octree), job.sampling_node(octree)
         sampling.process(job.camera(0), culling.process(job.camera(0)))  # compiles, or loads what was compiled
-        rows = []
+        counts, rows = FrameCounts(), []
         for frame in np.unique(np.linspace(0, job.n_frames - 1, LOOK_FRAMES).astype(int)):
             camera = job.camera(int(frame))
             culling_s, bits = _least(lambda camera=camera: culling.process(camera))
             sampling_s, chosen = _least(lambda camera=camera, bits=bits: sampling.process(camera, bits))
-            visible = int(np.bitwise_count(bits.bits).sum())
-            rows.append((visible, len(chosen.entries), chosen.n_points, culling_s, sampling_s))
-        visible, entries, points, culling_s, sampling_s = np.mean(rows, axis=0).tolist()
-        return cls(len(octree), visible, entries, points, _pixels(job), culling_s, sampling_s)
+            counts.add(bits, chosen)
+            rows.append((culling_s, sampling_s))
+        culling_s, sampling_s = np.mean(rows, axis=0).tolist()
+        mean = {name: float(np.mean(values)) for name, values in counts.lists().items()}
+        return cls(cells=len(octree), pixels=_pixels(job), culling_s=culling_s, sampling_s=sampling_s, **mean)
 
     @classmethod
     def of_run(cls, job: Job, per_frame: dict[str, Any]) -> Workload:

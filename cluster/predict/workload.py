@@ -12,9 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from ...nodes.cell_blocks import cell_blocks, cell_spacing
 from ...shared.camera import Camera
 from ...shared.messages import HEADER, RenderPoints, encode
+from ...shared.octree import Octree
 from ..job import Job
+from ..record import FrameCounts
 
 COLD_POINTS = 256
 """Points at the start of an entry that are read before the memory's prefetchers have caught up with it: the four
@@ -70,20 +73,30 @@ def count_workload(job: Job) -> Workload:
     """The workload of a job. Cost: culling and sampling of each frame, a few milliseconds."""
     octree = job.scene.octree()
     culling, sampling = job.culling_node(octree), job.sampling_node(octree)
-    visible, entries, points, cold, covered, sizes = np.zeros((6, job.n_frames))
+    spacing = _Spacing(job, octree) if job.point_size.adaptive else None
+    counts = FrameCounts()
+    cold, covered, sizes = np.zeros((3, job.n_frames))
     for frame in range(job.n_frames):
         camera = job.camera(frame)
         bits = culling.process(camera)
         chosen = sampling.process(camera, bits)
-        visible[frame] = np.bitwise_count(bits.bits).sum()
-        entries[frame], points[frame] = len(chosen.entries), chosen.n_points
+        counts.add(bits, chosen)
         cold[frame] = np.minimum(_counts(chosen.entries), COLD_POINTS).sum()
-        covered[frame] = chosen.n_points * _pixels_per_point(job, camera, chosen)
+        covered[frame] = chosen.n_points * _pixels_per_point(job, spacing, camera, chosen)
         head, payload = encode(chosen)
         sizes[frame] = len(head) + len(payload)
     pixels = job.views.width * job.views.height
     bits_bytes = HEADER.size + (len(octree) + 7) // 8
-    return Workload(len(octree), pixels, visible, entries, points, cold, covered, bits_bytes, sizes)
+    counted = {name: np.array(values, np.float64) for name, values in counts.lists().items()}
+    return Workload(
+        cells=len(octree),
+        pixels=pixels,
+        cold=cold,
+        covered=covered,
+        visibility_bytes=bits_bytes,
+        render_points_bytes=sizes,
+        **counted,
+    )
 
 
 def threads_of(render_threads: int) -> int:
@@ -91,17 +104,30 @@ def threads_of(render_threads: int) -> int:
     return render_threads or len(os.sched_getaffinity(0))
 
 
-def _pixels_per_point(job: Job, camera: Camera, chosen: RenderPoints) -> float:
+class _Spacing:
+    """How far apart the points of each cell are, by point."""
+
+    def __init__(self, job: Job, octree: Octree) -> None:
+        self._first, _, cells = cell_blocks(job.scene, octree)
+        self._spacing = cell_spacing(job.scene, octree, cells)
+
+    def of_points(self, index: np.ndarray) -> np.ndarray:
+        """(n,) float32, world units, of (n,) indices into the point-array."""
+        return self._spacing[np.searchsorted(self._first, index, side="right") - 1]
+
+
+def _pixels_per_point(job: Job, spacing: _Spacing | None, camera: Camera, chosen: RenderPoints) -> float:
     """Mean square of the points' sides, pixels²; from an even sample of them where sides depend on distance."""
     size = job.point_size
-    if not size.world or not chosen.n_points:
+    if not (size.world or spacing) or not chosen.n_points:
         return float(size.pixels**2)
     index = _sample(chosen.entries, chosen.n_points)
     x, y, z = (np.asarray(column[index], np.float64) for column in job.scene.positions())
     first, origin = job.scene.blocks()
     world = origin[np.searchsorted(first, index, side="right") - 1] + np.column_stack([x, y, z])
     depth = (world - camera.eye) @ camera.pixel_from_world[2, :3]
-    side = np.clip(size.world * camera.focal_px / np.maximum(depth, camera.near), size.pixels, size.maximum)
+    world_side = np.maximum(size.world, spacing.of_points(index)) if spacing else size.world
+    side = np.clip(world_side * camera.focal_px / np.maximum(depth, camera.near), size.pixels, size.maximum)
     inside = depth > camera.near
     return float(np.where(inside, np.rint(side) ** 2, 0).mean())
 
