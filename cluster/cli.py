@@ -69,6 +69,11 @@ def build(
     memory: Annotated[str, typer.Option(help="Memory to use, e.g. 4GB; default: half of what is free.")] = "",
     up: Annotated[str, typer.Option(help="Axis that points up: x, y, z, -x, -y, -z or auto.")] = "auto",
     attributes: Annotated[str, typer.Option(help="Keep only these, comma separated, e.g. rgb,normal.")] = "",
+    normals: Annotated[str, typer.Option(help="keep those of the files, or estimate them from neighbours.")] = "keep",
+    splats: Annotated[bool, typer.Option("--splats", help="Store what splats need: radii, and normals.")] = False,
+    features: Annotated[
+        bool, typer.Option("--features", help="Store which cells are flat, edges or corners; --splats with it.")
+    ] = False,
     strict: Annotated[bool, typer.Option(help="Refuse points that are not finite instead of dropping them.")] = False,
     overwrite: Annotated[bool, typer.Option(help="Replace an existing scene.")] = False,
     json: JsonOption = None,
@@ -88,6 +93,9 @@ def build(
         memory_bytes=parse_bytes(memory, "--memory") if memory else None,
         up=up,
         attributes=tuple(name.strip() for name in attributes.split(",")) if attributes else None,
+        normals=normals,
+        splats=splats,
+        features=features,
         strict=strict,
         overwrite=overwrite,
     )

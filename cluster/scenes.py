@@ -7,12 +7,14 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
 from ..shared.build import BuildReport, BuildSettings, build_scene
 from ..shared.errors import InputError
 from ..shared.files import write_json
+from ..shared.octree import FEATURES
 from ..shared.readers import expand_inputs, open_source
 from ..shared.store import Scene
 from .progress import FrameProgress
@@ -80,8 +82,13 @@ def verify_command(path: Path) -> None:
 
 
 def _scene_info(path: Path) -> dict[str, Any]:
-    info = asdict(Scene.open(path).info)
+    scene = Scene.open(path)
+    info = asdict(scene.info)
     size = sum(array["bytes"] for array in info.pop("arrays").values())
+    info["splats"] = scene.info.splats
+    if scene.info.features:
+        count = np.bincount(scene.octree(features=True).feature, minlength=len(FEATURES))
+        info["features"] = [f"{n:,} {name}" for name, n in zip(FEATURES, count, strict=True)]
     info["sources"] = [f"{source['name']} ({source['n_points']:,})" for source in info["sources"]]
     return {"scene": str(path), **info, "bytes": size}
 

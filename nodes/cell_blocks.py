@@ -7,6 +7,7 @@ from numba import njit
 
 from ..shared.octree import Octree
 from ..shared.store import Scene
+from .raster import CellFeatures
 
 NEIGHBOUR = 6
 """Which nearest neighbour tells the spacing. On a square grid it is one of the four across the diagonal, √2 steps away:
@@ -19,16 +20,36 @@ SAMPLES = 16
 """How many of them are asked for their neighbours; the median counts."""
 
 
+def owners_in_order(octree: Octree) -> np.ndarray:
+    """(b,) indices of the cells that own points, in stored order."""
+    owners = np.flatnonzero(octree.n_points if octree.point_order == "layered" else octree.is_leaf)
+    return owners[np.argsort(octree.first_point[owners])]
+
+
 def cell_blocks(scene: Scene, octree: Octree) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """((b,) int64 first point, (b, 3) float64 origin, (b,) int32 cell) of the cells that own points, in stored order.
 
     A cell's origin is that of the block it is stored in, so no coordinate changes.
     """
-    owners = np.flatnonzero(octree.n_points if octree.point_order == "layered" else octree.is_leaf)
-    owners = owners[np.argsort(octree.first_point[owners])]
+    owners = owners_in_order(octree)
     first_point = octree.first_point[owners]
     first, origin = scene.blocks()
     return first_point, origin[np.searchsorted(first, first_point, side="right") - 1], owners.astype(np.int32)
+
+
+def cell_features(octree: Octree) -> CellFeatures:
+    """What the cells that own points look like, in stored order, of an octree loaded with features."""
+    assert octree.feature is not None
+    assert octree.quad is not None
+    owners = owners_in_order(octree)
+    quad = octree.quad[owners]
+    return CellFeatures(
+        first_point=octree.first_point[owners],
+        n_points=octree.n_points[owners],
+        feature=octree.feature[owners],
+        quad_center=octree.centers[owners] + quad[:, 0],
+        quad_axes=np.ascontiguousarray(quad[:, 1:]),
+    )
 
 
 def cell_spacing(scene: Scene, octree: Octree, cells: np.ndarray) -> np.ndarray:

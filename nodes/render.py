@@ -8,11 +8,11 @@ import numpy as np
 
 from ..shared.camera import Camera
 from ..shared.colour import Colouring, colour_words
-from ..shared.errors import MessageError
+from ..shared.errors import MessageError, StoreError
 from ..shared.messages import RENDER_POINT, RenderPoints
 from ..shared.store import Scene
-from .cell_blocks import cell_blocks, cell_spacing
-from .point_filter import PointFilter
+from .cell_blocks import cell_blocks, cell_features, cell_spacing
+from .point_filter import PointFilter, features_left
 from .raster import Rasterizer, ResidentPoints
 
 
@@ -64,15 +64,22 @@ def load_points(scene: Scene, colouring: Colouring, wanted: Wanted = Wanted(), *
     verify : hold the checksums of the arrays it reads against the scene first: one read of each.
     Raises StoreError naming the array that is damaged or that the scene was built without.
     """
+    if wanted.splats and not scene.info.splats:
+        raise StoreError(f"{scene.path}: no radii and normals of splats: build it with --splats")
     if verify:
         attributes = [colouring.attribute, "classification" if wanted.point_filter.classes else None]
+        attributes += ["normal", "radius"] if wanted.splats else []
         scene.check(["x", "y", "z", *(f"attr_{name}" for name in dict.fromkeys(attributes) if name)])
     x, y, z = scene.positions()
     if wanted.point_filter:
         x = wanted.point_filter.filtered_x(scene, x, y, z)
-    block_spacing = None
+    block_spacing = features = None
+    if wanted.cells or wanted.features:
+        octree = scene.octree(features=wanted.features)
+        features = cell_features(octree) if wanted.features else None
+        if features and wanted.point_filter:
+            features = features_left(features, x)
     if wanted.cells:
-        octree = scene.octree()
         block_first_point, block_origin, cells = cell_blocks(scene, octree)
         if wanted.spacing:
             block_spacing = cell_spacing(scene, octree, cells)
@@ -85,6 +92,9 @@ def load_points(scene: Scene, colouring: Colouring, wanted: Wanted = Wanted(), *
         colour_words(scene, colouring),
         block_first_point,
         block_origin,
+        normal=scene.attribute("normal") if wanted.splats else None,
+        radius=scene.attribute("radius") if wanted.splats else None,
         root_edge=scene.info.edge,
         block_spacing=block_spacing,
+        features=features,
     )

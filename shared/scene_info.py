@@ -14,7 +14,7 @@ import numpy as np
 from .errors import StoreError
 from .points import ATTRIBUTES
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 SCENE_FILE = "scene.json"
 POINT_ORDERS = ("layered", "depth-first")
 UP_AXES = ("x", "y", "z", "-x", "-y", "-z", "auto")
@@ -28,7 +28,10 @@ CELL_ARRAYS = {
     "cell_n_points": np.dtype("<i8"),
     "cell_n_below": np.dtype("<i8"),
     "cell_cone": np.dtype("<f4"),
+    "cell_feature": np.dtype("u1"),
+    "cell_quad": np.dtype("<f4"),
 }
+_ROW_SHAPES = {"cell_cone": (4,), "cell_quad": (3, 3)}
 _MAX_BYTES = 1 << 26
 
 
@@ -59,6 +62,7 @@ class SceneInfo:
     n_dropped : input points left out because a coordinate was not finite.
     block_levels : in layered order, the points of a cell are relative to the centre of its ancestor this many levels
         above; 0 in depth-first order, where blocks are cells of up to 2048 points or leaves.
+    features : whether cells say what their points look like (``cell_feature``, ``cell_quad``).
     up : the axis that points up, one of ``UP_AXES``.  crs : well-known text, or None.
     build : the settings the scene was built with.
     """
@@ -80,7 +84,13 @@ class SceneInfo:
     sources: tuple[SourceCount, ...]
     build: dict[str, Any]
     arrays: dict[str, ArrayInfo]
+    features: bool = False
     format_version: int = FORMAT_VERSION
+
+    @property
+    def splats(self) -> bool:
+        """Whether points have what splats need: normals and radii."""
+        return {"normal", "radius"} <= set(self.attributes)
 
     def to_json(self) -> str:
         """The text of ``scene.json``."""
@@ -112,6 +122,8 @@ def parse_info(path: Path) -> SceneInfo:
             f"{path}: format_version = {version}, this splatpipe reads up to {FORMAT_VERSION}: "
             "upgrade splatpipe, or build the scene again"
         )
+    if version == 1:
+        content["features"] = False
     for field in fields(SceneInfo):
         if field.name not in content:
             raise StoreError(f"{path}: {field.name} not found")
@@ -134,9 +146,14 @@ def parse_info(path: Path) -> SceneInfo:
 def expected_arrays(info: SceneInfo) -> dict[str, tuple[np.dtype, tuple[int, ...]]]:
     """(dtype, shape) of each array that a scene of these counts and attributes has."""
     expected: dict[str, tuple[np.dtype, tuple[int, ...]]] = {}
+    present = {
+        "cell_cone": "normal" in info.attributes,
+        "cell_feature": info.features,
+        "cell_quad": info.features,
+    }
     for name, dtype in CELL_ARRAYS.items():
-        if name != "cell_cone" or "normal" in info.attributes:
-            expected[name] = (dtype, (info.n_cells, 4) if name == "cell_cone" else (info.n_cells,))
+        if present.get(name, True):
+            expected[name] = (dtype, (info.n_cells, *_ROW_SHAPES.get(name, ())))
     for name in ("x", "y", "z"):
         expected[name] = (np.dtype("<f4"), (info.n_stored,))
     for name in info.attributes:
@@ -207,6 +224,7 @@ _RULES = {
         f"different names of {', '.join(ATTRIBUTES)}",
     ),
     "block_levels": _COUNT,
+    "features": (lambda v: isinstance(v, bool), "true or false"),
     "up": (lambda v: v in UP_AXES, f"one of {', '.join(UP_AXES)}"),
     "crs": (lambda v: v is None or isinstance(v, str), "a text or null"),
     "sources": (lambda v: isinstance(v, list) and all(_is_source(s) for s in v), "a list of name and n_points"),

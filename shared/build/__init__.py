@@ -8,8 +8,11 @@ module             owns
 ``morton``         root cube, keys, the counting sort's kernels
 ``partition``      keys → cells, and point indices in leaf order
 ``flatness``       the eigenvalue criterion
+``eigen``          3×3 symmetric matrices
 ``sets``           order inside a leaf, level-of-detail sets of inner cells
 ``cones``          normal cones
+``neighbours``     estimated normals, splat radii
+``features``       flat, edge and corner cells, quads of the flat ones
 ``subtree``        one partition: the above put together
 ``runs``           sorted runs on disk, for inputs larger than memory, and partitions that fit
 ``streamed``       a leaf larger than memory

@@ -105,7 +105,7 @@ class Assembly:
         top.n_points = owned
         top.first_point = array.n_stored + np.cumsum(owned) - owned
         blocks = block_level(top, "layered", self._capacity)
-        array.append(pool, stored[len(pool) :], top.level, top.code, owned, blocks, workers)
+        array.append(pool, stored[len(pool) :], top.level, top.code, owned, top.count, blocks, workers)
 
     def _span_top(self, top: LinkedCells) -> None:
         tree, inner, roots = self._with_roots(top)

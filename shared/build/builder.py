@@ -9,13 +9,16 @@ from pathlib import Path
 
 import numpy as np
 
+from ..camera_path import axis_vector
 from ..errors import InputError
 from ..points import PointBatch
 from ..readers.source import Source
 from ..scene_info import SceneInfo, SourceCount
 from .assembly import Assembly
-from .ingest import Bounds, Columns, Tally, common_attributes, declared_bounds, finite_batches, root_bounds
+from .features import cell_features
+from .ingest import Bounds, Columns, Tally, declared_bounds, finite_batches, planned_attributes, root_bounds
 from .morton import keys_of, root_cube
+from .neighbours import SurfaceRule, add_surface
 from .parallel import Workers
 from .partition import Subdivision
 from .point_array import PointArrayWriter, block_level, block_levels_of
@@ -40,7 +43,9 @@ def build_scene(
     progress : called with (``read``, ``bounds`` or ``write``, points done, points in all or None), from any thread.
     Points that do not fit into ``settings.memory_bytes`` are sorted into runs inside ``.OUT.partial`` and built
     partition by partition; cells, sets and their order are the same for any memory and any number of threads, the
-    place of a cell's range in the point-array is not. The runs take as much disk as the points, beside the scene.
+    place of a cell's range in the point-array is not. Neighbours, for normals and radii, are searched inside a
+    partition: next to its faces radii are a little larger and normals less exact than in memory. The runs take as much
+    disk as the points, beside the scene.
     A build that was killed is started again from clean.
     Raises InputError for inputs that cannot be used, a target that must not be replaced, or a full disk; nothing is
     left behind then.
@@ -60,8 +65,9 @@ class _Build:
         if not sources:
             raise InputError("build: found no inputs, expected at least one")
         self.sources, self.out, self.settings, self.progress = sources, out, settings, progress
-        self.attributes, self.dropped_attributes = common_attributes(sources, settings.attributes)
-        self.memory: MemoryPlan = plan_memory(settings, self.attributes)
+        self.read_attributes, self.attributes, self.dropped_attributes = planned_attributes(sources, settings)
+        self.makes = set(self.attributes) - set(self.read_attributes)
+        self.memory: MemoryPlan = plan_memory(settings, self.attributes, bool(self.makes))
         self.rule = Subdivision(settings.points_per_cell, settings.max_depth, settings.flatness)
         self.declared = declared_bounds(sources)
         self.stage_s: dict[str, float] = {}
@@ -73,7 +79,9 @@ class _Build:
         ):
             with self.timed("read"):
                 held, runs, tally = self.read_all()
-                origin, edge = root_cube(*root_bounds(self.declared, tally))
+                bounds = root_bounds(self.declared, tally)
+                origin, edge = root_cube(*bounds)
+            self.surface = self.surface_rule(origin, edge, bounds)
             self.array = PointArrayWriter(self.writer, self.attributes, origin, edge)
             self.assembly = Assembly(self.settings.point_order, self.settings.points_per_cell)
             if runs is None:
@@ -120,10 +128,10 @@ class _Build:
         promised = [source.info.n_points for source in self.sources]
         expected = None if None in promised else sum(n for n in promised if n is not None)
         capacity = self.memory.capacity
-        columns = Columns(capacity if expected is None else max(1, min(capacity, expected)), self.attributes)
+        columns = Columns(capacity if expected is None else max(1, min(capacity, expected)), self.read_attributes)
         runs: Runs | None = None
         tally = Tally()
-        for batch in finite_batches(self.sources, self.attributes, self.memory.batch, self.settings.strict, tally):
+        for batch in finite_batches(self.sources, self.read_attributes, self.memory.batch, self.settings.strict, tally):
             while len(batch) > columns.room:
                 room = columns.room
                 columns.add(batch.select(slice(0, room)))
@@ -144,7 +152,7 @@ class _Build:
 
     def new_runs(self, bounds: Bounds) -> Runs:
         directory = self.writer.partial / "runs"
-        return Runs(directory, self.attributes, *root_cube(*bounds), self.rule, self.workers)
+        return Runs(directory, self.read_attributes, *root_cube(*bounds), self.rule, self.workers)
 
     def measured_bounds(self) -> Bounds:
         """Tight bounds by a pass over the positions alone."""
@@ -161,12 +169,15 @@ class _Build:
             return
         with self.timed("write"):
             cells, root_set = append_streamed_leaf(
-                partition, runs, self.memory.capacity, self.settings, self.array, self.workers
+                partition, runs, self.memory.capacity, self.settings, self.surface, self.array, self.workers
             )
             self.assembly.add(cells, root_set)
 
     def add_partition(self, points: PointBatch, keys: np.ndarray, level: int, code: int, n_total: int) -> None:
         order = self.settings.point_order
+        if self.surface:
+            with self.timed("neighbours"):
+                points = add_surface(points, keys, self.surface, self.workers)
         with self.timed("sort"):
             subtree = build_subtree(keys, points.attributes.get("normal"), level, code, self.rule, order, self.workers)
         with self.timed("write"):
@@ -181,15 +192,34 @@ class _Build:
                 cells.level[owners],
                 cells.code[owners],
                 cells.n_points[owners],
+                cells.count[owners],
                 block_level(cells, order, self.settings.points_per_cell)[owners],
                 self.workers,
                 lambda n_stored: self.progress("write", done + int(n_stored * share), n_total),
             )
 
+    def surface_rule(self, origin: np.ndarray, edge: float, bounds: Bounds) -> SurfaceRule | None:
+        """What is made of neighbours. Normals of surveys (LAS) point up, others away from the middle of the bounds."""
+        if not self.makes:
+            return None
+        is_survey = all(source.info.format in ("las", "laz", "copc") for source in self.sources)
+        up = axis_vector("z" if self.settings.up == "auto" else self.settings.up) if is_survey else None
+        return SurfaceRule(
+            normals="normal" in self.makes,
+            radii="radius" in self.makes,
+            origin=origin,
+            edge=edge,
+            up=up,
+            center=bounds[0] + (bounds[1] - bounds[0]) / 2,
+        )
+
     def finish(self, origin: np.ndarray, edge: float, tally: Tally) -> SceneInfo:
         """Write the cells, the blocks and ``scene.json``, and put the scene in its place."""
         cells = self.assembly.cell_arrays("normal" in self.attributes)
         first, block_origin = self.array.blocks()
+        if self.settings.features:
+            with self.timed("features"):
+                cells |= cell_features(cells, origin, edge, first, block_origin, self.writer.written, self.workers)
         for name, values in {**cells, "block_first_point": first, "block_origin": block_origin}.items():
             self.writer.write_array(name, values)
         info = SceneInfo(
@@ -204,6 +234,7 @@ class _Build:
             n_blocks=len(first),
             n_dropped=tally.n_dropped,
             attributes=self.attributes,
+            features=self.settings.features,
             block_levels=block_levels_of(self.settings.point_order, self.settings.points_per_cell),
             up=self.settings.up,
             crs=next((s.info.crs for s in self.sources if s.info.crs), None),

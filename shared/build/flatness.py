@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from .eigen import eigen_symmetric
 from .morton import compact_bits
 
 N_MOMENTS = 10
@@ -82,7 +83,7 @@ def merge_children(children, half, parent):
 
 @njit(nogil=True, cache=True)
 def flatness(central):
-    """Smallest eigenvalue over the sum of eigenvalues of (10,) central moments, in [0, 1/3]; cyclic Jacobi.
+    """Smallest eigenvalue over the sum of eigenvalues of (10,) central moments, in [0, 1/3].
 
     0 for coincident points: a point is as flat as can be.
     """
@@ -96,21 +97,7 @@ def flatness(central):
     trace = a[0, 0] + a[1, 1] + a[2, 2]
     if not trace > 0.0:
         return 0.0
-    for _ in range(12):
-        for i in range(2):
-            for j in range(i + 1, 3):
-                if a[i, j] == 0.0:
-                    continue
-                theta = (a[j, j] - a[i, i]) / (2.0 * a[i, j])
-                t = (1.0 if theta >= 0.0 else -1.0) / (abs(theta) + np.sqrt(theta * theta + 1.0))
-                c = 1.0 / np.sqrt(t * t + 1.0)
-                s = t * c
-                for k in range(3):
-                    u, v = a[k, i], a[k, j]
-                    a[k, i], a[k, j] = c * u - s * v, s * u + c * v
-                for k in range(3):
-                    u, v = a[i, k], a[j, k]
-                    a[i, k], a[j, k] = c * u - s * v, s * u + c * v
+    eigen_symmetric(a, np.empty((3, 3)))
     return max(0.0, min(a[0, 0], a[1, 1], a[2, 2]) / trace)
 
 

@@ -12,15 +12,38 @@ from ..errors import InputError
 from ..points import ATTRIBUTES, PointBatch
 from ..readers.source import Source
 from .morton import bounds
+from .settings import BuildSettings
+
+
+def planned_attributes(
+    sources: list[Source], settings: BuildSettings
+) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
+    """(read, stored, dropped): what is read of all inputs, that and what is made of neighbours, and what is left out
+    because only some inputs have it.
+
+    Raises InputError if a wanted one is in no input.
+    """
+    given = settings.normals == "keep" and all("normal" in source.info.attributes for source in sources)
+    made = {"normal": settings.normals == "estimate" or (settings.radii and not given), "radius": settings.radii}
+    wanted = settings.attributes
+    if wanted is not None:
+        wanted = tuple(a for a in wanted if not made.get(a)) + (("normal",) if settings.radii and given else ())
+    kept, dropped = common_attributes(sources, wanted)
+    read = tuple(a for a in kept if not made.get(a))
+    stored = tuple(a for a in ATTRIBUTES if a in read or made.get(a))
+    return read, stored, tuple(a for a in dropped if not made.get(a))
 
 
 def common_attributes(sources: list[Source], wanted: tuple[str, ...] | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """(kept, dropped): attributes that all inputs have, in the order of ``ATTRIBUTES``, and those only some have.
 
+    Radii are never read: they are made for one root cube.
     Raises InputError if a wanted one is in no input.
     """
     present = [set(source.info.attributes) for source in sources]
-    candidates = [a for a in ATTRIBUTES if (wanted is None or a in wanted) and any(a in p for p in present)]
+    candidates = [
+        a for a in ATTRIBUTES if a != "radius" and (wanted is None or a in wanted) and any(a in p for p in present)
+    ]
     for name in wanted or ():
         if name not in candidates:
             raise InputError(f"attributes: {name} is in none of the inputs")

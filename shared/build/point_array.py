@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from ..octree import cell_centers
-from ..points import ATTRIBUTES, PointBatch
+from ..points import ATTRIBUTES, RADIUS_STEPS, PointBatch
 from .parallel import Workers
 from .subtree import LinkedCells
 from .writer import SceneWriter, writing
@@ -59,6 +59,23 @@ def _gather_positions(positions, stored, begin, end, block_first, block_origin, 
         z[j - begin] = positions[i, 2] - block_origin[block, 2]
 
 
+def radius_steps(n_below: np.ndarray, n_points: np.ndarray) -> np.ndarray:
+    """(c,) int64: codes by which radii grow in sets of ``n_points`` that stand for ``n_below`` points of a surface.
+
+    Spacings grow with the square root of their ratio; rounded up.
+    """
+    return np.ceil(RADIUS_STEPS / 2 * np.log2(n_below / np.maximum(n_points, 1)) - 1e-9).astype(np.int64)
+
+
+@njit(nogil=True, cache=True)
+def _gather_radii(column, stored, begin, end, cell_end, steps, out):
+    cell = np.searchsorted(cell_end, begin, side="right")
+    for j in range(begin, end):
+        while cell_end[cell] <= j:
+            cell += 1
+        out[j - begin] = max(np.int64(column[stored[j]]) - steps[cell], 0)
+
+
 @njit(nogil=True, cache=True)
 def _gather(column, stored, begin, end, out):
     for j in range(begin, end):
@@ -89,6 +106,7 @@ class PointArrayWriter:
         level: np.ndarray,
         code: np.ndarray,
         n_points: np.ndarray,
+        n_below: np.ndarray,
         block_level: np.ndarray,
         workers: Workers,
         advance: Callable[[int], None] | None = None,
@@ -96,13 +114,19 @@ class PointArrayWriter:
         """Append ``points`` picked by ``stored``.
 
         stored : (m,) uint32 indices of points.
-        level, code, n_points, block_level : the cells that own them, one after another; n_points sums up to m.
+        level, code, n_points, n_below, block_level : the cells that own them, one after another; n_points sums up to m,
+            n_below counts the input points that they stand for.
         advance : called with the points written of these.
         """
         first, origin = self._open_blocks(level, code, n_points, block_level)
         with writing(self._writer.partial):
-            tasks = [(self._append_positions, points.positions, stored, first, origin, advance)]
-            tasks += [(self._append_column, name, column, stored) for name, column in points.attributes.items()]
+            tasks: list[tuple] = [(self._append_positions, points.positions, stored, first, origin, advance)]
+            for name, column in points.attributes.items():
+                if name == "radius":
+                    cells = np.cumsum(n_points), radius_steps(n_below, n_points)
+                    tasks.append((self._append_column, name, column, stored, _gather_radii, *cells))
+                else:
+                    tasks.append((self._append_column, name, column, stored, _gather))
             workers.map(lambda task, *arguments: task(*arguments), tasks)
         self.n_stored += len(stored)
 
@@ -131,11 +155,11 @@ class PointArrayWriter:
             if advance:
                 advance(end)
 
-    def _append_column(self, name: str, column: np.ndarray, stored: np.ndarray) -> None:
+    def _append_column(self, name: str, column: np.ndarray, stored: np.ndarray, gather, *more: np.ndarray) -> None:
         out = np.empty(min(_CHUNK, len(stored)), column.dtype)
         for begin in range(0, len(stored), _CHUNK):
             end = min(begin + _CHUNK, len(stored))
-            _gather(column, stored, begin, end, out)
+            gather(column, stored, begin, end, *more, out)
             self._columns[name].write(out[: end - begin])
 
     def blocks(self) -> tuple[np.ndarray, np.ndarray]:

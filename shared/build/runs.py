@@ -65,7 +65,7 @@ class Runs:
         workers: Workers,
     ) -> None:
         self._directory = directory
-        self._attributes = attributes
+        self.attributes = attributes
         self._origin, self._edge = origin, edge
         self._rule = rule
         self._workers = workers
@@ -79,7 +79,7 @@ class Runs:
 
     def add(self, points: PointBatch) -> None:
         """Sort points and write them as a run. Memory: 12 bytes a point and a chunk a column."""
-        keys = self._keys(points)
+        keys = self.keys(points)
         ids, first = sort_into_buckets(keys, BUCKET_LEVEL, 0, _N_BUCKETS, self._workers)
         self._counts += np.diff(first)
         if self._moments is not None:
@@ -158,7 +158,7 @@ class Runs:
         ancestor = code >> 3 * (level - ahead)
         if (ahead, ancestor) not in self._ahead:
             counts = np.zeros(8 ** (lowest - ahead), np.int64)
-            for keys in map(self._keys, self.stream(ahead, ancestor, ())):
+            for keys in map(self.keys, self.stream(ahead, ancestor, ())):
                 base = ancestor << 3 * (lowest - ahead)
                 count_buckets(keys, 0, len(keys), 3 * (MAX_LEVEL - lowest), base, counts)
             self._ahead[ahead, ancestor] = counts
@@ -172,7 +172,7 @@ class Runs:
         if not self._rule.flatness > 0:
             return True
         moments, central = np.zeros(N_MOMENTS, np.int64), np.empty(N_MOMENTS)
-        for keys in map(self._keys, self.stream(level, code, ())):
+        for keys in map(self.keys, self.stream(level, code, ())):
             add_moments(keys, np.arange(len(keys), dtype=np.uint32), 0, len(keys), level, moments)
         central_moments(moments, central)
         return bool(flatness(central) >= self._rule.flatness)
@@ -180,24 +180,24 @@ class Runs:
     def load(self, partition: Partition) -> tuple[PointBatch, np.ndarray]:
         """(points, keys) of a partition that fits."""
         if partition.level <= BUCKET_LEVEL:
-            points = self._read_buckets(*_buckets(partition.level, partition.code), self._attributes)
+            points = self._read_buckets(*_buckets(partition.level, partition.code), self.attributes)
         else:
-            columns = Columns(partition.n_points, self._attributes)
+            columns = Columns(partition.n_points, self.attributes)
             for batch in self.stream(partition.level, partition.code):
                 columns.add(batch)
             points = columns.points()
-        return points, self._keys(points)
+        return points, self.keys(points)
 
     def stream(self, level: int, code: int, attributes: tuple[str, ...] | None = None) -> Iterator[PointBatch]:
         """The points of a cell in the order of one sort in memory, in small batches; all attributes or some."""
-        wanted = self._attributes if attributes is None else attributes
+        wanted = self.attributes if attributes is None else attributes
         for begin, end, n in self._small_groups(*_buckets(level, code)):
             if n <= _CHUNK:
                 batches = iter([self._read_buckets(begin, end, wanted)])
             else:
                 batches = self._stream_slices(self._slices(begin, end), wanted)
             for batch in batches:
-                keys = self._keys(batch)
+                keys = self.keys(batch)
                 if level > BUCKET_LEVEL:
                     batch = batch.select(keys >> 3 * (MAX_LEVEL - level) == code)
                 elif end - begin > 1:
@@ -219,7 +219,8 @@ class Runs:
         if n:
             yield first, end, n
 
-    def _keys(self, points: PointBatch) -> np.ndarray:
+    def keys(self, points: PointBatch) -> np.ndarray:
+        """(n,) int64 Morton keys."""
         return keys_of(points.positions, self._origin, self._edge, self._workers)
 
     def _slices(self, begin: int, end: int) -> list[tuple[int, int, int]]:

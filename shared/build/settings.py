@@ -12,6 +12,8 @@ from ..octree import MAX_LEVEL
 from ..points import ATTRIBUTES
 from ..scene_info import POINT_ORDERS, UP_AXES
 
+NORMALS = ("keep", "estimate")
+
 
 @dataclass(frozen=True)
 class BuildSettings:
@@ -26,6 +28,10 @@ class BuildSettings:
     overwrite : replace an existing scene, once the new one is whole.
     up : axis that points up, stored in the scene: one of ``UP_AXES``.
     attributes : the ones to keep; None for all.
+    normals : ``keep`` those of the inputs, where all have them, or ``estimate`` them from neighbours, see
+        ``neighbours``.
+    splats : store what splats need: radii, and normals, estimated where not all inputs have them.
+    features : store which cells are flat, edges and corners, see ``features``; splats with them.
     threads : None for one a core.
 
     Raises InputError for a value out of range.
@@ -40,6 +46,9 @@ class BuildSettings:
     overwrite: bool = False
     up: str = "auto"
     attributes: tuple[str, ...] | None = None
+    normals: str = "keep"
+    splats: bool = False
+    features: bool = False
     threads: int | None = None
 
     def __post_init__(self) -> None:
@@ -52,10 +61,16 @@ class BuildSettings:
             (self.memory_bytes is None or self.memory_bytes > 0, "memory_bytes", "a number > 0"),
             (self.up in UP_AXES, "up", f"one of {', '.join(UP_AXES)}"),
             (not unknown, "attributes", f"names of {', '.join(ATTRIBUTES)}"),
+            (self.normals in NORMALS, "normals", f"one of {', '.join(NORMALS)}"),
             (self.threads is None or self.threads >= 1, "threads", "at least 1"),
         ):
             if not holds:
                 raise InputError(f"build: {key} = {getattr(self, key)!r}, expected {expected}")
+
+    @property
+    def radii(self) -> bool:
+        """Whether points get splat radii: quads of flat cells are held against them."""
+        return self.splats or self.features
 
 
 @dataclass
@@ -149,21 +164,26 @@ class MemoryPlan:
 
 _FIXED_BYTES = 64 << 20
 """Counters of the counting sort, chunks on their way to files, cells: what does not grow with the points held."""
-_SORT_BYTES = 8 + 4 + 4 + 10
-"""A point's key, its index, a second index while cells are refined, and two and a half stored indices (layered)."""
+_KEY_BYTES = 8
+_SORT_BYTES = 4 + 4 + 10
+"""A point's index, a second index while cells are refined, and two and a half stored indices (layered)."""
+NEIGHBOUR_BYTES = 72
+"""A point while neighbours are searched: order, position in that order, tree, results."""
 _READER_BYTES = 320
 """A point in a reader: file bytes, decoded columns and temporaries, one batch ahead."""
 _MIN_CAPACITY = 1 << 16
 _MAX_BATCH = 1 << 18
 
 
-def plan_memory(settings: BuildSettings, attributes: tuple[str, ...]) -> MemoryPlan:
+def plan_memory(settings: BuildSettings, attributes: tuple[str, ...], neighbours: bool = False) -> MemoryPlan:
     """Divide the memory that the process does not hold yet between readers and points.
 
+    attributes : of the stored points.  neighbours : whether neighbours are searched, before points are sorted.
     Raises InputError if it is too little for a partition of a few cells.
     """
     budget = settings.memory_bytes or available_memory_bytes() // 2
-    point_bytes = 24 + sum(ATTRIBUTES[a].itemsize for a in attributes) + _SORT_BYTES
+    working = max(_SORT_BYTES, NEIGHBOUR_BYTES * neighbours)
+    point_bytes = 24 + sum(ATTRIBUTES[a].itemsize for a in attributes) + _KEY_BYTES + working
     left = budget - resident_bytes() - _FIXED_BYTES
     capacity = min(left * 3 // 4 // point_bytes, 2**32 - 1)
     needed = max(_MIN_CAPACITY, 2 * settings.points_per_cell)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from numba import njit
 
 from ..points import PointBatch
 from .cones import add_normals, start_cone, widen_cone
 from .ingest import Columns
+from .neighbours import SurfaceRule, add_surface
 from .parallel import Workers
 from .point_array import PointArrayWriter, block_level
 from .runs import Partition, Runs
@@ -32,11 +35,13 @@ def append_streamed_leaf(
     runs: Runs,
     capacity: int,
     settings: BuildSettings,
+    surface: SurfaceRule | None,
     array: PointArrayWriter,
     workers: Workers,
 ) -> tuple[LinkedCells, PointBatch]:
     """Append the points of an oversize leaf in the order of its permutation: (its cell, the first points of its set).
 
+    surface : what is made of neighbours: a window is a random part of the leaf, so its spacings tell those of all.
     Cost: one pass over the leaf's points for every ``capacity`` points, and one more where there are normals.
     """
     n = leaf.n_points
@@ -57,9 +62,9 @@ def append_streamed_leaf(
     blocks = block_level(cell, settings.point_order, settings.points_per_cell)
     total, cone = np.zeros(3), np.zeros(4)
     first_set, complete = None, True
-    for begin in range(0, n, capacity):
-        end = min(begin + capacity, n)
-        window = Columns(end - begin, array.attributes).whole()
+    n_windows = -(-n // capacity)
+    for begin, end in pairwise(n * i // n_windows for i in range(n_windows + 1)):
+        window = Columns(end - begin, runs.attributes).whole()
         read = 0
         for batch in runs.stream(leaf.level, leaf.code):
             source, target = np.empty((2, len(batch)), np.int64)
@@ -69,14 +74,18 @@ def append_streamed_leaf(
             for name, column in window.attributes.items():
                 column[target] = batch.attributes[name][source]
             read += len(batch)
+        if surface:
+            window = add_surface(window, runs.keys(window), surface, workers, share=(end - begin) / n)
         in_order = np.arange(end - begin, dtype=np.uint32)
-        array.append(window, in_order, cell.level, cell.code, np.array([end - begin]), blocks, workers)
+        size = np.array([end - begin])
+        array.append(window, in_order, cell.level, cell.code, size, size, blocks, workers)
         if first_set is None:
             first_set = window.select(np.arange(min(settings.points_per_cell, end - begin)))
-        if "normal" in window.attributes and complete:
+        if "normal" in runs.attributes and complete:
             complete = add_normals(window.attributes["normal"], in_order, 0, end - begin, total)
     assert first_set is not None
-    if "normal" in array.attributes and start_cone(total if complete else np.zeros(3), cone):
+    complete = complete and "normal" in runs.attributes  # estimated ones are gone: any direction
+    if start_cone(total if complete else np.zeros(3), cone):
         for batch in runs.stream(leaf.level, leaf.code):
             widen_cone(batch.attributes["normal"], np.arange(len(batch), dtype=np.uint32), 0, len(batch), cone)
     cell.normal_sum, cell.cone = (total if complete else np.zeros(3))[None], cone[None]

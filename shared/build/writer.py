@@ -60,6 +60,10 @@ class ColumnFile:
         self._crc = zlib.crc32(write_all(self._file, rows), self._crc)
         self._rows += len(rows)
 
+    def written(self) -> np.ndarray:
+        """The rows so far: a read-only map."""
+        return np.memmap(self.path, self.dtype, "r", self._data_offset, (self._rows, *self._row_shape))
+
     def close(self) -> ArrayInfo:
         """Write the final header."""
         size = self._file.tell() - self._data_offset
@@ -138,6 +142,10 @@ class SceneWriter:
         array = np.ascontiguousarray(array)
         with writing(self.partial):
             self.open_column(name, array.dtype, array.shape[1:]).write(array)
+
+    def written(self, name: str) -> np.ndarray:
+        """What has been written of an array: a read-only map."""
+        return self.columns[name].written()
 
     def close_columns(self) -> dict[str, ArrayInfo]:
         """Finish every array and say what was written."""
