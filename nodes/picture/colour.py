@@ -61,32 +61,37 @@ def _tables() -> tuple[np.ndarray, np.ndarray]:
 
 @njit(nogil=True, cache=True)
 def _colour_rows(words, shades, background, s, decode, encode, top, out, first, end):
-    """Fill rows of ``out``; ``top`` is its largest value."""
-    shade = 1.0
-    total = np.empty(4)
+    """Fill rows of ``out``; ``top`` is its largest value. Sums are of light for s > 1, else of stored values."""
+    behind = np.empty(3)
+    behind_alpha = background[3] / 255.0
+    for k in range(3):
+        stored = np.float64(background[k])
+        behind[k] = behind_alpha * (stored if s == 1 else _at(decode, stored * _DECODE_STEPS))
     for row in range(first, end):
         for column in range(out.shape[1]):
-            total[:] = 0.0
+            red = green = blue = total = 0.0
             for y in range(row * s, row * s + s):
                 for x in range(column * s, column * s + s):
                     word = words[y, x]
                     if word == _EMPTY:
-                        shade = 1.0
-                        alpha = background[3] / 255.0
-                    else:
-                        if shades.size:
-                            shade = np.float64(shades[y, x])
-                        alpha = np.float64(word >> np.uint64(24) & _BYTE) / 255.0
-                    for k in range(3):
-                        value = background[k] if word == _EMPTY else np.uint8(word >> np.uint64(8 * k) & _BYTE)
-                        shaded = value * shade
-                        total[k] += alpha * (shaded if s == 1 else _at(decode, shaded * _DECODE_STEPS))
-                    total[3] += alpha
-            for k in range(3):
-                mean = total[k] / total[3] if total[3] > 0.0 else 0.0
-                stored = mean / 255.0 if s == 1 else _at(encode, mean * _ENCODE_STEPS)
+                        red, green, blue = red + behind[0], green + behind[1], blue + behind[2]
+                        total += behind_alpha
+                        continue
+                    shade = np.float64(shades[y, x]) if shades.size else 1.0
+                    alpha = (word >> np.uint64(24) & _BYTE) * (1.0 / 255.0)
+                    r = (word & _BYTE) * shade
+                    g = (word >> np.uint64(8) & _BYTE) * shade
+                    b = (word >> np.uint64(16) & _BYTE) * shade
+                    if s > 1:
+                        r = _at(decode, r * _DECODE_STEPS)
+                        g = _at(decode, g * _DECODE_STEPS)
+                        b = _at(decode, b * _DECODE_STEPS)
+                    red, green, blue, total = red + alpha * r, green + alpha * g, blue + alpha * b, total + alpha
+            scale = 1.0 / total if total > 0.0 else 0.0
+            for k, mean in enumerate((red * scale, green * scale, blue * scale)):
+                stored = mean * (1.0 / 255.0) if s == 1 else _at(encode, mean * _ENCODE_STEPS)
                 out[row, column, k] = np.int64(stored * top + 0.5)
-            out[row, column, 3] = np.int64(total[3] / (s * s) * top + 0.5)
+            out[row, column, 3] = np.int64(total / (s * s) * top + 0.5)
 
 
 @njit(nogil=True, cache=True, inline="always")

@@ -62,32 +62,35 @@ def neighbours(radius_px: float) -> np.ndarray:
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _shade_rows(depths, offsets, exponent, wrap, out, first, end):
-    """Fill rows of ``out``. depths : (h, 2 w) float32, the odd columns."""
+    """Fill rows of ``out``. depths : (h, 2 w) float32, the odd columns.
+
+    Unsigned indices need no test for negative ones, so that the inner loop is vectorised.
+    """
     height, width = out.shape
+    product = np.empty(width, np.float32)
     for row in range(first, end):
-        for column in range(width):
-            out[row, column] = _ONE
+        product[:] = _ONE
         for k in range(len(offsets)):
             other, step = row + offsets[k, 0], offsets[k, 1]
             if other < 0 or other >= height:
                 continue
             inside_from = min(max(0, -step), width)
             inside_to = max(inside_from, min(width, width - step))
-            for column in range(inside_from, inside_to):
-                _darken(out, row, column, depths[other, 2 * (column + step) + 1] / depths[row, 2 * column + 1])
+            here, there = np.uintp(inside_from), np.uintp(inside_from + step)
+            for i in range(np.uintp(inside_to - inside_from)):
+                product[here + i] *= _nearer(depths, np.uintp(other), there + i, np.uintp(row), here + i)
             if wrap:
-                for column in range(inside_from):
-                    nearby = (column + step) % width
-                    _darken(out, row, column, depths[other, 2 * nearby + 1] / depths[row, 2 * column + 1])
-                for column in range(inside_to, width):
-                    nearby = (column + step) % width
-                    _darken(out, row, column, depths[other, 2 * nearby + 1] / depths[row, 2 * column + 1])
+                for column in range(width):
+                    if column < inside_from or column >= inside_to:
+                        beside = (column + step) % width
+                        product[column] *= _nearer(depths, other, beside, row, column)
         for column in range(width):
-            if out[row, column] < _ONE:
-                out[row, column] = out[row, column] ** exponent
+            out[row, column] = product[column] ** exponent if product[column] < _ONE else _ONE
 
 
-@njit(nogil=True, cache=True, inline="always")
-def _darken(out, row, column, ratio):
-    """Multiply by min(1, ratio); by 1 where either depth is that of background, NaN."""
-    out[row, column] *= ratio if ratio < _ONE else _ONE
+@njit(nogil=True, cache=True, error_model="numpy", inline="always")
+def _nearer(depths, other_row, other_column, row, column):
+    """min(1, depth of the other / depth); 1 where either is background, whose depth is NaN."""
+    one, two = np.uintp(1), np.uintp(2)
+    ratio = depths[other_row, two * np.uintp(other_column) + one] / depths[row, two * np.uintp(column) + one]
+    return ratio if ratio < _ONE else _ONE
