@@ -88,7 +88,7 @@ def drawn_cells(cells: CellFeatures, entries: np.ndarray) -> np.ndarray:
     stop = begin + entries["range"]
     first_cell = np.searchsorted(cells.first_point + cells.n_points, begin, side="right")
     end_cell = np.searchsorted(cells.first_point, stop, side="left")
-    drawn = first_cell < end_cell
+    drawn = (first_cell < end_cell) & (stop > begin)
     n_cells = len(cells.first_point)
     steps = np.bincount(first_cell[drawn], minlength=n_cells + 1) - np.bincount(end_cell[drawn], minlength=n_cells + 1)
     return np.cumsum(steps[:-1]) > 0
