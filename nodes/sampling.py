@@ -33,7 +33,8 @@ class SamplingNode:
     octree : cells in breadth-first order, either point order.
     pixel_threshold : a cell that projects to at most this many pixels across is drawn from its own points, if
         those suffice; 0 draws every visible point.
-    points_per_pixel : of a set in stratified order, drawn for each pixel that its cell covers.
+    points_per_pixel : points of a set in stratified order, for each pixel that the surface in its cell (``Octree.area``)
+        covers where it is seen face on.
     Raises ConfigError for a threshold that is not a finite number ≥ 0, or points per pixel that are not one > 0.
     """
 
@@ -57,8 +58,8 @@ class SamplingNode:
         """The render-points array of one frame, ascending in offset, adjacent ranges merged.
 
         Every visible leaf has exactly one drawn ancestor-or-self, and nothing invisible is drawn. N being the
-        square of its projected size, a cell whose points stand in stratified order yields the first
-        max(1, ⌊``points_per_pixel`` N⌋) of them, or all. Any other cell below the threshold yields at least
+        square of its projected size and A its area, a cell whose points stand in stratified order yields the first
+        max(1, ⌊``points_per_pixel`` A N⌋) of them, or all. Any other cell below the threshold yields at least
         min(its points, max(1, ⌊N ln N⌋)): the head of its range in layered order, every stride-th of the range in
         depth-first order; and a leaf above the threshold all its points.
 

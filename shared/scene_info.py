@@ -28,6 +28,7 @@ CELL_ARRAYS = {
     "cell_n_points": np.dtype("<i8"),
     "cell_n_below": np.dtype("<i8"),
     "cell_cone": np.dtype("<f4"),
+    "cell_area": np.dtype("<f4"),
     "cell_feature": np.dtype("u1"),
     "cell_quad": np.dtype("<f4"),
 }
@@ -148,6 +149,7 @@ def expected_arrays(info: SceneInfo) -> dict[str, tuple[np.dtype, tuple[int, ...
     expected: dict[str, tuple[np.dtype, tuple[int, ...]]] = {}
     present = {
         "cell_cone": "normal" in info.attributes,
+        "cell_area": info.point_order == "layered" and info.format_version >= 2,
         "cell_feature": info.features,
         "cell_quad": info.features,
     }

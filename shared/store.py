@@ -75,11 +75,12 @@ class Scene:
             for name in CELL_ARRAYS
             if name in self.info.arrays and name not in left_out
         }
-        cone = arrays.pop("cone", None)
+        cone, area = arrays.pop("cone", None), arrays.pop("area", None)
         octree = Octree(
             origin=np.array(self.info.origin),
             edge=self.info.edge,
             cone=cone,
+            area=area,
             point_order=self.info.point_order,
             **arrays,
         )
@@ -216,6 +217,8 @@ def check_octree(octree: Octree, info: SceneInfo, path: Path) -> None:
     ends = np.cumsum(count[owner][order])
     tiled = ends[-1] == info.n_stored and np.array_equal(first[owner][order], ends - count[owner][order])
     require(bool(tiled), "first_point", f"the ranges do not tile the {info.n_stored} stored points")
+    if octree.area is not None:
+        require(np.isfinite(octree.area) & (octree.area > 0), "area", "not a finite number > 0")
     if octree.cone is not None:
         require(
             np.isfinite(octree.cone).all(axis=1) & (np.abs(octree.cone) <= 1.0001).all(axis=1), "cone", "not a cone"

@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 BUCKET_LEVEL = 6
+SORTED_LEVELS = 6
 _U64 = (1 << 64) - 1
 
 
@@ -72,6 +73,20 @@ def _shuffled(level, code, members):
     return out
 
 
+def reference_strata(level, code, n):
+    """Ranks along the curve in stratified order: bits read backwards, from a start of the cell's own."""
+    bits = max(n - 1, 0).bit_length()
+    mask = _mixed(code + (level + 1) * 0x9E3779B97F4A7C15 & _U64) & ((1 << bits) - 1)
+    reversed_ = (int(f"{i:0{bits}b}"[::-1], 2) if bits else 0 for i in range(1 << bits))
+    return [r ^ mask for r in reversed_ if r ^ mask < n]
+
+
+def _stratified(level, code, members):
+    """(members in stratified order, the rank of each)."""
+    ranks = reference_strata(level, code, len(members))
+    return [members[rank] for rank in ranks], ranks
+
+
 def reference_build(positions, *, points_per_cell, max_depth=21, flatness=0.0):
     """(level, code) → (points below, indices of the points the cell owns in stored order, its children), layered."""
     keys = reference_keys(positions, *reference_root(positions))
@@ -82,10 +97,14 @@ def reference_build(positions, *, points_per_cell, max_depth=21, flatness=0.0):
         if split and flatness > 0:
             split = reference_flatness([keys[i] for i in members], level) >= flatness
         if not split:
-            by_bucket = sorted(members, key=lambda i: keys[i] >> 3 * (21 - BUCKET_LEVEL))  # stable
-            own = _shuffled(level, code, by_bucket)
+            if len(members) > points_per_cell:
+                by_bucket = sorted(members, key=lambda i: keys[i] >> 3 * (21 - BUCKET_LEVEL))  # stable
+                own, ranks = _shuffled(level, code, by_bucket), range(len(members))
+            else:
+                shift = max(0, 3 * (21 - level - SORTED_LEVELS))
+                own, ranks = _stratified(level, code, sorted(members, key=lambda i: keys[i] >> shift))  # stable
             cells[level, code] = (len(members), own, [])
-            return own
+            return list(zip(ranks, own, strict=True))
         children, sets = [], []
         for octant in range(8):
             child = code << 3 | octant
@@ -99,9 +118,10 @@ def reference_build(positions, *, points_per_cell, max_depth=21, flatness=0.0):
         by_remainder = sorted(range(len(sets)), key=lambda c: -(n * len(sets[c]) % available))  # stable
         for c in by_remainder[: n - sum(quota)]:
             quota[c] += 1
-        own = _shuffled(level, code, [i for s, q in zip(sets, quota, strict=True) for i in s[:q]])
+        along_curve = [i for s, q in zip(sets, quota, strict=True) for _, i in sorted(s[:q])]
+        own, ranks = _stratified(level, code, along_curve)
         cells[level, code] = (len(members), own, children)
-        return own
+        return list(zip(ranks, own, strict=True))
 
     build(0, 0, list(range(len(positions))))
     return cells

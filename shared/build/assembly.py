@@ -10,7 +10,7 @@ from .cones import merge_cones
 from .parallel import Workers
 from .partition import Cells
 from .point_array import PointArrayWriter, block_level
-from .sets import sample_inner, set_sizes
+from .sets import merge_areas, sample_inner, set_sizes
 from .subtree import LinkedCells, link
 
 _FIELDS = ("level", "code", "count", "first_point", "n_points")
@@ -96,6 +96,7 @@ class Assembly:
         leaf_sizes = np.zeros(len(tree), np.int64)
         leaf_sizes[roots] = sizes
         tree.n_points = set_sizes(tree.level, tree.first_child, tree.n_children, leaf_sizes, self._capacity)
+        tree.n_points[roots] = [p.n_points[0] for p in self._parts]  # what their order was made for
         tree.first_point[roots] = np.cumsum(sizes) - sizes
         owned = tree.n_points[inner]
         tree.first_point[inner] = len(pool) + np.cumsum(owned) - owned
@@ -131,9 +132,12 @@ class Assembly:
             "cell_n_points": merged["n_points"][order],
             "cell_n_below": cells.count,
         }
+        if self._layered:
+            area = np.concatenate([_or_zeros(p.area, len(p)) for p in self._parts])[order]
+            arrays["cell_area"] = merge_areas(cells.level, cells.parent, area)
         if with_cones:
-            total = np.concatenate([_or_zeros(p.normal_sum, len(p), 3) for p in self._parts])[order]
-            cone = np.concatenate([_or_zeros(p.cone, len(p), 4) for p in self._parts])[order]
+            total = np.concatenate([_or_zeros(p.normal_sum, (len(p), 3)) for p in self._parts])[order]
+            cone = np.concatenate([_or_zeros(p.cone, (len(p), 4)) for p in self._parts])[order]
             arrays["cell_cone"] = merge_cones(cells.first_child, cells.n_children, total, cone)
         return {name: array.astype(CELL_ARRAYS[name]) for name, array in arrays.items()}
 
@@ -143,5 +147,5 @@ def _no_cells() -> LinkedCells:
     return LinkedCells(*([none] * 9))
 
 
-def _or_zeros(array: np.ndarray | None, n: int, width: int) -> np.ndarray:
-    return np.zeros((n, width)) if array is None else array
+def _or_zeros(array: np.ndarray | None, shape: int | tuple[int, int]) -> np.ndarray:
+    return np.zeros(shape) if array is None else array

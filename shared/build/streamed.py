@@ -14,7 +14,7 @@ from .neighbours import SurfaceRule, add_surface
 from .parallel import Workers
 from .point_array import PointArrayWriter, block_level
 from .runs import Partition, Runs
-from .sets import permutation, place
+from .sets import RANDOM_AREA, permutation, place
 from .settings import BuildSettings
 from .subtree import LinkedCells
 
@@ -58,6 +58,7 @@ def append_streamed_leaf(
         start=one,
         first_point=one + array.n_stored,
         n_points=one + n,
+        area=np.array([RANDOM_AREA]),
     )
     blocks = block_level(cell, settings.point_order, settings.points_per_cell)
     total, cone = np.zeros(3), np.zeros(4)

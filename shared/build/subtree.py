@@ -9,7 +9,7 @@ import numpy as np
 from .cones import leaf_cones
 from .parallel import Workers
 from .partition import Cells, Subdivision, subtree_cells
-from .sets import sample_inner, set_sizes, shuffle_leaves
+from .sets import sample_inner, set_sizes, shuffle_leaves, stratify_leaves
 
 
 @dataclass
@@ -17,6 +17,7 @@ class LinkedCells:
     """Cells in breadth-first order with their links and point ranges; the fields of ``octree.Octree``, and ``start``.
 
     start : (n,) int64, where the cell's points begin in the ids that it was made from.
+    area : (n,) float64 or None, of leaves in layered order, see ``sets``; 0 for inner cells.
     normal_sum : (n, 3) float64 or None, cone : (n, 4) float64 or None; set for leaves only, see ``cones``.
     """
 
@@ -29,6 +30,7 @@ class LinkedCells:
     start: np.ndarray
     first_point: np.ndarray
     n_points: np.ndarray
+    area: np.ndarray | None = None
     normal_sum: np.ndarray | None = None
     cone: np.ndarray | None = None
 
@@ -103,15 +105,14 @@ def build_subtree(
         owners = leaves[np.argsort(cells.first_point[leaves])]
     ends = np.cumsum(cells.count[leaves])
     cuts = np.searchsorted(ends, [b for _, b in workers.ranges(int(ends[-1]), pieces=8 * workers.n_threads)][:-1])
-    workers.map(
-        shuffle_leaves,
-        [
-            (part, cells.level, cells.code, cells.start, cells.count, cells.first_point, ids, stored)
-            for part in np.split(leaves, cuts)
-        ],
-    )
+    leaf_parts = np.split(leaves, cuts)
+    links = (cells.level, cells.code, cells.start, cells.count, cells.first_point)
     if point_order == "layered":
-        sample_inner(cells, rule.points_per_cell, stored, workers)
+        capacity, cells.area = rule.points_per_cell, np.zeros(len(cells))
+        workers.map(stratify_leaves, [(part, *links, capacity, keys, ids, stored, cells.area) for part in leaf_parts])
+        sample_inner(cells, capacity, stored, workers)
+    else:
+        workers.map(shuffle_leaves, [(part, *links, ids, stored) for part in leaf_parts])
     if normals is not None:
         cells.normal_sum, cells.cone = leaf_cones(cells, normals, stored, workers)
     return Subtree(cells, stored, owners)
