@@ -129,7 +129,7 @@ class GlComputeRasterizer(_GlPointRasterizer):
         self._words = self._buffer(bytes=self._image.nbytes, what="framebuffer")
         self._empty = context.buffer(self._image)
 
-    def _draw(self, camera: Camera, entries: np.ndarray, blocks: np.ndarray, batches: list[Batch]) -> np.ndarray:
+    def _draw(self, camera: Camera, entries: np.ndarray, batches: list[Batch]) -> np.ndarray:
         self._context.copy_buffer(self._words, self._empty)
         for program in self._programs:
             self._set_camera(program, camera)
@@ -177,7 +177,7 @@ class GlPointsRasterizer(_GlPointRasterizer):
         self._depth_only = context.framebuffer(depth_attachment=depth)  # glClear is undefined for integer colours
         context.enable_only(moderngl.DEPTH_TEST | moderngl.PROGRAM_POINT_SIZE)
 
-    def _draw(self, camera: Camera, entries: np.ndarray, blocks: np.ndarray, batches: list[Batch]) -> np.ndarray:
+    def _draw(self, camera: Camera, entries: np.ndarray, batches: list[Batch]) -> np.ndarray:
         self._words.write(self._empty)
         self._depth_only.clear(depth=1.0)
         self._framebuffer.use()

@@ -120,7 +120,7 @@ class GlResident(ABC):
         with self._context:  # another rasterizer of this thread may have made its own current
             self._runs, self._n_runs = self._write(self._runs, runs, "runs"), len(runs)
             self._rows.write(self._block_rows(camera, blocks))
-            image = self._draw(camera, entries, blocks, batches)
+            image = self._draw(camera, entries, batches)
             check_errors(self._context, "drawing")
         return image
 
@@ -133,7 +133,7 @@ class GlResident(ABC):
         """(k, 3, 4) float32 matrices of (k,) blocks."""
 
     @abstractmethod
-    def _draw(self, camera: Camera, entries: np.ndarray, blocks: np.ndarray, batches: list[Batch]) -> np.ndarray:
+    def _draw(self, camera: Camera, entries: np.ndarray, batches: list[Batch]) -> np.ndarray:
         """Draw the runs that were sent; the words of the frame."""
 
     def _upload(self, block_first: np.ndarray, columns: Sequence[np.ndarray], borders: np.ndarray | None) -> None:

@@ -135,7 +135,7 @@ class GlSplatRasterizer(GlResident):
         rows[:, :, 3] = frame.eye_from_blocks(camera, self._block_origin[blocks])
         return rows
 
-    def _draw(self, camera: Camera, entries: np.ndarray, blocks: np.ndarray, batches: list[Batch]) -> np.ndarray:
+    def _draw(self, camera: Camera, entries: np.ndarray, batches: list[Batch]) -> np.ndarray:
         import moderngl
 
         context = self._context
