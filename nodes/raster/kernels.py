@@ -20,6 +20,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+from llvmlite import ir
 from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
@@ -30,6 +31,10 @@ from .blocks import FLOAT32, FULL, HIGH, OUTSIDE, block_rows
 BATCH = 1024
 """Points drawn at a time: their 28 KiB of scratch fit the first-level cache; long loops keep more misses under way."""
 
+PREFETCHED = 512
+"""Points of the next piece that are asked for while one is drawn: pieces are short and far apart where a scene is drawn
+from many cells, and the hardware's own prefetching needs some lines and stops at a page."""
+
 RUN = 64
 """Framebuffer words that are drawn to, or not, as one: 512 bytes of a row."""
 
@@ -38,12 +43,17 @@ _EMPTY = np.uint64(FRAMEBUFFER_EMPTY)
 _FLOAT_MAX = np.float32(np.finfo(np.float32).max)
 _ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
 _TEN_BITS = np.uint32(1023)
+_NAN = np.float32(np.nan)
+
+FILTERED = np.uint32(1 << 30)
+"""Bit of a high word: the point is not drawn."""
 
 
 class Points(NamedTuple):
     """Columns of the point-array; those that no segment is read from are empty.
 
     x, y, z : (n,) float32.  high, low : (n,) uint32, see ``compact``.  colour : (n,) uint32.
+    filtered : whether ``FILTERED`` is set anywhere in ``high``.
     """
 
     x: np.ndarray
@@ -52,6 +62,7 @@ class Points(NamedTuple):
     high: np.ndarray
     low: np.ndarray
     colour: np.ndarray
+    filtered: bool
 
 
 class View(NamedTuple):
@@ -91,6 +102,25 @@ def _fetch_add_intrinsic(_context: Any, counter: Any, amount: Any) -> Any:
 _fetch_add: Any = intrinsic(_fetch_add_intrinsic)
 
 
+def _prefetch_intrinsic(_context: Any, column: Any, index: Any) -> Any:
+    """Ask for the cache line of ``column[index]``, which may lie beyond the end."""
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        array = cgutils.create_struct_proxy(signature.args[0])(context, builder, arguments[0])
+        pointer = builder.bitcast(builder.gep(array.data, [arguments[1]]), cgutils.voidptr_t)
+        kind = ir.IntType(32)
+        function = cgutils.get_or_insert_function(
+            builder.module, ir.FunctionType(ir.VoidType(), [cgutils.voidptr_t, kind, kind, kind]), "llvm.prefetch.p0i8"
+        )
+        builder.call(function, [pointer, kind(0), kind(3), kind(1)])
+        return context.get_dummy_value()
+
+    return types.void(column, types.int64), codegen
+
+
+_prefetch: Any = intrinsic(_prefetch_intrinsic)
+
+
 @njit(nogil=True, cache=True)
 def draw(points, blocks, pieces, frustum, view, words, dirty, turn, counter):
     """Draw pieces into one framebuffer until none is left.
@@ -113,13 +143,15 @@ def draw(points, blocks, pieces, frustum, view, words, dirty, turn, counter):
             if precision == OUTSIDE:
                 continue
             side_at_one = np.float32(blocks.world_side[s] * frustum.focal_px)
+            if k + 1 < len(pieces):
+                _prefetch_points(points, pieces[k + 1].first, min(pieces[k + 1].count, PREFETCHED))
             for done in range(0, pieces[k].count, BATCH):
                 n = min(BATCH, pieces[k].count - done)
                 first = pieces[k].first + done * stride
                 if stride == 1 and precision == FLOAT32:
                     _project(points.x, points.y, points.z, first, n, rows, side_at_one, view, len(words), place, depth)
                 elif stride == 1:
-                    _decode(points.high, points.low, first, n, precision, x, y, z)
+                    _decode(points.high, points.low, first, n, precision, points.filtered, x, y, z)
                     _project(x, y, z, 0, n, rows, side_at_one, view, len(words), place, depth)
                 else:  # gathered first, so that every stride goes through the same loops
                     for i in range(n):
@@ -131,7 +163,7 @@ def draw(points, blocks, pieces, frustum, view, words, dirty, turn, counter):
                             high[i] = points.high[j]
                             low[i] = points.low[j] if precision == FULL else np.uint32(0)
                     if precision != FLOAT32:
-                        _decode(high, low, 0, n, precision, x, y, z)
+                        _decode(high, low, 0, n, precision, points.filtered, x, y, z)
                     _project(x, y, z, 0, n, rows, side_at_one, view, len(words), place, depth)
                 if stride == 1:
                     _pack(depth, points.colour, first, n, packed)
@@ -145,7 +177,20 @@ def draw(points, blocks, pieces, frustum, view, words, dirty, turn, counter):
 
 
 @njit(nogil=True, cache=True)
-def _decode(high, low, first, n, precision, x, y, z):
+def _prefetch_points(points, first, count):
+    """Ask for ``count`` points from ``first`` on, 16 a cache line."""
+    for j in range(first, first + count, 16):
+        if len(points.high):
+            _prefetch(points.high, j)
+        else:
+            _prefetch(points.x, j)
+            _prefetch(points.y, j)
+            _prefetch(points.z, j)
+        _prefetch(points.colour, j)
+
+
+@njit(nogil=True, cache=True)
+def _decode(high, low, first, n, precision, filtered, x, y, z):
     """Bins of ``n`` points from ``first`` on, as float32: exact, at most 20 bits."""
     if precision == HIGH:
         for i in range(n):
@@ -161,6 +206,10 @@ def _decode(high, low, first, n, precision, x, y, z):
             y[i] = np.float32(np.int32((h & _TEN_BITS) << np.uint32(10) | (w & _TEN_BITS)))
             h, w = h >> np.uint32(10), w >> np.uint32(10)
             z[i] = np.float32(np.int32((h & _TEN_BITS) << np.uint32(10) | (w & _TEN_BITS)))
+    if filtered:
+        for i in range(n):
+            if high[np.uintp(first) + np.uintp(i)] >= FILTERED:
+                x[i] = _NAN
 
 
 @njit(nogil=True, cache=True)
