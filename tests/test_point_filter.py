@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from splatpipe.nodes.culling import CullingNode, padded_half_edges
 from splatpipe.nodes.point_filter import ClipBox, PointFilter, features_left
-from splatpipe.nodes.raster import CellFeatures, PointSize
+from splatpipe.nodes.raster import CellFeatures, PointSize, ResidentPoints, SplatSettings
 from splatpipe.nodes.raster.choose import make_rasterizer
 from splatpipe.nodes.raster.gl_context import gl_available
 from splatpipe.nodes.render import RenderNode, Wanted, load_points
@@ -20,7 +20,8 @@ from splatpipe.shared.camera import look_at, perspective_camera
 from splatpipe.shared.colour import Colouring
 from splatpipe.shared.config import Box
 from splatpipe.shared.errors import ConfigError
-from splatpipe.shared.messages import FRAMEBUFFER_EMPTY, VisibilityBits
+from splatpipe.shared.messages import FRAMEBUFFER_EMPTY, RENDER_POINT, VisibilityBits
+from splatpipe.shared.points import pack_normals, pack_radii
 from splatpipe.shared.store import Scene
 
 EXAMPLES = settings(max_examples=100, derandomize=True, deadline=None)
@@ -234,3 +235,32 @@ def test_a_cell_that_lost_a_point_is_no_flat_cell():
     left = features_left(CellFeatures(first, n, np.array([1, 1, 2, 3], np.uint8), *quads), x)
     assert left.feature.tolist() == [1, 0, 2, 0]
     assert left.feature.dtype == np.uint8
+
+
+@pytest.mark.parametrize(("rasterizer", "style"), [("cpu", "compact"), ("cpu", "splats"), ("gl", "splats")])
+def test_no_form_of_a_filtered_point_is_drawn(rasterizer, style):
+    """Red points of NaN among green ones, single in their block and first in it: no red in any pixel."""
+    if rasterizer == "gl" and not gl_available()[0]:
+        pytest.skip("no OpenGL")
+    rng = np.random.default_rng(6)
+    n = 2000
+    x, y, z = rng.normal(size=(3, n)).astype(np.float32) * 0.4
+    first = np.array([0, 1, 500, 1000, 1700])
+    gone = rng.random(n) < 0.5
+    gone[[0, 500]] = True  # a block of one point; the first of a block
+    gone[1000:1700] = True  # a whole block
+    x[gone] = np.nan
+    colour = np.where(gone, 0xFF0000FF, 0xFF00FF00).astype(np.uint32)
+    normal = pack_normals(np.column_stack([y, z, np.ones(n)]))
+    radius = pack_radii(np.full(n, 0.02), 4.0)
+    points = ResidentPoints(x, y, z, colour, first, np.zeros((5, 3)), normal, radius, 4.0)
+    splats = SplatSettings(lighting=False) if style == "splats" else None
+    everything = np.array([(0, n, 1), (1, n - 1, 3)], RENDER_POINT)
+    with make_rasterizer(
+        rasterizer, points, WIDTH, HEIGHT, PointSize(), 2, splats=splats, compact=style == "compact"
+    ) as drawer:
+        for camera in cameras():
+            words = drawer.draw(camera, everything)
+            shown = words[words != FRAMEBUFFER_EMPTY].astype(np.uint32)
+            assert len(shown) > 20
+            assert (shown & 0xFF == 0).all()

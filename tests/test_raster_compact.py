@@ -19,6 +19,7 @@ from splatpipe.nodes.raster.blocks import (
 )
 from splatpipe.nodes.raster.compact import CompactPositions, compact_positions
 from splatpipe.nodes.raster.cpu import CpuRasterizer
+from splatpipe.nodes.raster.kernels import FILTERED
 from splatpipe.nodes.raster.reference import (
     compact_rows,
     fixed_point_bins,
@@ -81,6 +82,24 @@ def test_encoding_equals_the_twin(threads):
     np.testing.assert_array_equal(found.step, step)
     assert (step > 0).mean() > 0.8
     assert (np.diff(points.block_first_point) == 1).any()
+
+
+def test_what_is_filtered_out_is_marked_and_moves_no_grid():
+    points = cells(3000)
+    gone = np.random.default_rng(1).random(len(points)) < 0.4
+    first = points.block_first_point
+    gone[first[3] : first[5]] = True  # two whole blocks
+    gone[first[7]] = True  # the first point of a block
+    x = np.where(gone, np.float32(np.nan), points.x)
+    filtered = replace(points, x=x)
+    found = compact_positions(filtered, 2)
+    bins, lower, step = fixed_point_bins(filtered, BITS)
+    np.testing.assert_array_equal(found.high & FILTERED != 0, gone)
+    np.testing.assert_array_equal(unpack_bins(found.high, found.low), bins)
+    np.testing.assert_array_equal(found.lower, lower)
+    np.testing.assert_array_equal(found.step, step)
+    left = replace(points, x=np.where(gone, 1e30, points.x).astype(np.float32))  # a grid that counted them shows it
+    assert (compact_positions(left, 1).step[:, 0] > step[:, 0]).any()
 
 
 @settings(max_examples=80, deadline=None, derandomize=True)

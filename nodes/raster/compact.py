@@ -20,7 +20,7 @@ from numba import njit
 
 from . import ResidentPoints
 from .blocks import BITS
-from .kernels import _fetch_add
+from .kernels import FILTERED, _fetch_add
 
 
 @dataclass(frozen=True)
@@ -28,6 +28,7 @@ class CompactPositions:
     """Positions of points by blocks; arrays as of ``ResidentPoints`` where the name is the same.
 
     high, low : (n,) uint32: bits 0–9, 10–19 and 20–29 are the high and the low halves of the bins of x, y and z.
+        ``kernels.FILTERED`` is set in ``high`` where x is NaN: the point is not drawn.
     lower : (b, 3) float64, world units: lower corner of each block's box, relative to the block's origin.
     step : (b, 3) float64, world units: size of a bin; 0 along an axis on which all points of the block are one.
 
@@ -42,7 +43,7 @@ class CompactPositions:
 
 
 def compact_positions(points: ResidentPoints, threads: int) -> CompactPositions:
-    """The points' positions in fixed point. They must be finite.
+    """The points' positions in fixed point. They must be finite, but for the NaN of points that are filtered out.
 
     Cost: O(n), two reads of the positions, block by block on ``threads`` threads; 8 bytes a point, nothing else.
     """
@@ -66,10 +67,13 @@ def _encode(x, y, z, first, high, low, lower, step, counter):
     while b < len(first) - 1:
         begin, end = first[b], first[b + 1]
         if begin < end:
-            lower[b, 0], step[b, 0] = _grid(x, begin, end)
-            lower[b, 1], step[b, 1] = _grid(y, begin, end)
-            lower[b, 2], step[b, 2] = _grid(z, begin, end)
+            lower[b, 0], step[b, 0] = _grid(x, x, begin, end)
+            lower[b, 1], step[b, 1] = _grid(y, x, begin, end)
+            lower[b, 2], step[b, 2] = _grid(z, x, begin, end)
         for i in range(begin, end):
+            if np.isnan(x[i]):
+                high[i], low[i] = FILTERED, 0
+                continue
             bx = _bin(x[i], lower[b, 0], step[b, 0])
             by = _bin(y[i], lower[b, 1], step[b, 1])
             bz = _bin(z[i], lower[b, 2], step[b, 2])
@@ -79,11 +83,14 @@ def _encode(x, y, z, first, high, low, lower, step, counter):
 
 
 @njit(nogil=True, cache=True)
-def _grid(column, begin, end):
-    """Least value and size of a bin."""
-    least = most = column[begin]
+def _grid(column, x, begin, end):
+    """Least value and size of a bin, of the points whose x is a number; zeros if there is none."""
+    least, most = np.float32(np.inf), np.float32(-np.inf)
     for i in range(begin, end):
-        least, most = min(least, column[i]), max(most, column[i])
+        if not np.isnan(x[i]):
+            least, most = min(least, column[i]), max(most, column[i])
+    if least > most:
+        return 0.0, 0.0
     return np.float64(least), (np.float64(most) - np.float64(least)) / 2.0**BITS
 
 

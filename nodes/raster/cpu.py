@@ -80,7 +80,10 @@ class CpuRasterizer:
         else:
             columns |= {"x": points.x, "y": points.y, "z": points.z}
         columns["colour"] = points.colour
-        self._points = kernels.Points(**{name: _read_only(column) for name, column in columns.items()})
+        filtered = bool(columns["high"].max(initial=0) >= kernels.FILTERED)
+        self._points = kernels.Points(
+            **{name: _read_only(column) for name, column in columns.items()}, filtered=filtered
+        )
         self._blocks = Blocks(
             np.ascontiguousarray(points.block_origin, np.float64), world_sides(points, size), lower, step
         )

@@ -53,16 +53,19 @@ def project_float32(
 
 
 def fixed_point_bins(points: ResidentPoints, bits: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Positions as bins of their block's bounding box, 2**bits an axis. Every block holds points.
+    """Positions as bins of their block's bounding box, 2**bits an axis. Every block holds points; those whose x is NaN
+    do not count, and have bin 0.
 
     Returns (n, 3) int64 bins, (b, 3) float64 lower corners relative to the block's origin, (b, 3) float64 bin sizes.
     """
     relative = np.column_stack([points.x, points.y, points.z]).astype(np.float64)
-    lower = np.minimum.reduceat(relative, points.block_first_point)
-    step = (np.maximum.reduceat(relative, points.block_first_point) - lower) / 2**bits
+    filtered = np.isnan(points.x)
+    relative[filtered] = np.nan
+    lower = np.nan_to_num(np.fmin.reduceat(relative, points.block_first_point))
+    step = (np.nan_to_num(np.fmax.reduceat(relative, points.block_first_point)) - lower) / 2**bits
     block = np.searchsorted(points.block_first_point, np.arange(len(points)), side="right") - 1
     unit = np.where(step > 0, step, 1)
-    bins = np.floor((relative - lower[block]) / unit[block]).astype(np.int64)
+    bins = np.floor(np.where(filtered[:, None], 0, relative - lower[block]) / unit[block]).astype(np.int64)
     return np.minimum(bins, 2**bits - 1), lower, step
 
 

@@ -52,7 +52,8 @@ void main() {
     vec4 position = vec4(x[point], y[point], z[point], 1.0);
     vec3 p = position * block;
     Splat splat = Splat(vec2(0.0), 0.0, 0.0, vec2(0.0), 0u, 0u);
-    if (all(lessThanEqual(abs(p), vec3(FLOAT_MAX))) && p.z >= near) {
+    bool kept = (floatBitsToUint(position.x) & 0x7FFFFFFFu) <= 0x7F800000u;  // as in points.glsl
+    if (kept && all(lessThanEqual(abs(p), vec3(FLOAT_MAX))) && p.z >= near) {
         float largest = max(max(abs(p.x), abs(p.y)), p.z);  // divided by first, so that nothing overflows
         vec3 towards_eye = -normalize(p / largest);
         uint word = normal_word[point];
