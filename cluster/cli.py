@@ -293,12 +293,20 @@ def bench_raster(
     points: Annotated[int, typer.Option(help="Number of points.", min=1000)] = 4_000_000,
     size: Annotated[int, typer.Option(help="Width and height, pixels.", min=16, max=8192)] = 1024,
     repeats: Annotated[int, typer.Option(help="Timed frames of each.", min=3)] = 15,
+    roofline: Annotated[
+        bool, typer.Option("--roofline", help="Instead: what limits cpu, by part, from 512² to 3840×2160.")
+    ] = False,
     json: JsonOption = None,
 ) -> None:
     """Every rasterizer present, VTK and NumPy on the same points in one run.
 
     Example: `splatpipe bench raster --json raster.json`
     """
+    if roofline:
+        from .bench.roofline import bench_roofline, print_roofline
+
+        _report(bench_roofline(n_points=points, repeats=repeats), print_roofline, json)
+        return
     from .bench.raster import bench_raster as measure
     from .bench.raster import print_raster
 

@@ -25,11 +25,17 @@ from ...nodes.raster.reference import reference_frame
 from ...shared.camera import Camera, look_at, perspective_camera
 from ...shared.errors import DeviceError
 from ...shared.messages import FRAMEBUFFER_EMPTY, RENDER_POINT
-from ...shared.surfaces import bumpy_sphere, point_orders
+from ...shared.surfaces import RUN_POINTS, bumpy_sphere, point_orders
 from ..record import machine_record, spread_ms
 
 ONE_PIXEL = "one pixel"
 """The order in which all points fall on one pixel: the worst case for whoever shares a framebuffer."""
+
+SHUFFLED_BATCHES = "shuffled batches"
+"""Stored order, but the runs shuffled: cells in any order, as a scene of many draws is."""
+
+_BLOCK_POINTS = RUN_POINTS // 2
+"""Points of a block, where points that are close lie close in the array: half a full cell."""
 
 _FOV_Y_RAD = 0.7
 _DISTANCE = 3.6
@@ -46,22 +52,16 @@ def bench_raster(
 ) -> dict[str, Any]:
     """Time frames of ``size``² pixels of each rasterizer, for each order of the points.
 
-    rasterizers : some of cpu, gl, gl-points, vtk, numpy; None: all of them.
+    rasterizers : some of cpu, cpu compact, gl, gl-points, vtk, numpy; None: all of them.
 
     Returns a JSON-able dict: ``rows`` (one for each rasterizer and order), ``omitted`` (rasterizer and reason),
     ``read_limit`` (reading 16 bytes a point with all threads), the machine.
     """
-    surface = bumpy_sphere(n_points)
-    colour = np.random.default_rng(1).integers(1 << 24, dtype=np.uint32, size=n_points) | np.uint32(255 << 24)
-    cases = {order: (surface[p], colour[p]) for order, p in point_orders(surface).items()}
-    cases[ONE_PIXEL] = (_within_one_pixel(surface, size), colour)
-
     rows, omitted = [], {}
     read_s: list[float] = []
-    for order, (positions, words) in cases.items():
-        points = _resident(positions, words)
-        read_s += _read_times(points, repeats)
-        expected = _rgb(reference_frame(points, _camera(0, size), _everything(points)))
+    for order, points in bench_cases(n_points, camera_of(0, size, size)):
+        read_s += read_times([points.x, points.y, points.z, points.colour], repeats)
+        expected = _rgb(reference_frame(points, camera_of(0, size, size), everything(points)))
         for name in rasterizers or _CONTESTANTS:
             if name in omitted:
                 continue
@@ -145,14 +145,29 @@ def _measure(draw: Draw, expected: np.ndarray, repeats: int) -> dict[str, Any]:
     }
 
 
+def bench_cases(n_points: int, camera: Camera) -> Iterator[tuple[str, ResidentPoints]]:
+    """Order of the points and the points: a closed surface, and all of it within one pixel of ``camera``."""
+    surface = bumpy_sphere(n_points)
+    colour = np.random.default_rng(1).integers(1 << 24, dtype=np.uint32, size=n_points) | np.uint32(255 << 24)
+    orders = point_orders(surface)
+    whole = n_points // RUN_POINTS * RUN_POINTS
+    runs = np.random.default_rng(2).permutation(orders["stored"][:whole].reshape(-1, RUN_POINTS)).ravel()
+    orders[SHUFFLED_BATCHES] = np.append(runs, orders["stored"][whole:])
+    for order, p in orders.items():
+        yield order, _resident(surface[p], colour[p], n_points if order == "random" else _BLOCK_POINTS)
+    yield ONE_PIXEL, _resident(_within_one_pixel(surface, camera), colour, n_points)
+
+
 Contestant = Callable[[ResidentPoints, int], Any]
 """(points, size) → context manager of (device name, known once something is drawn, and draw)."""
 
 
 @contextmanager
-def _splatpipe(name: str, points: ResidentPoints, size: int) -> Iterator[tuple[Callable[[], str], Draw]]:
-    with make_rasterizer(name, points, size, size, PointSize(), None) as rasterizer:
-        yield lambda: rasterizer.device, lambda i: rasterizer.draw(_camera(i, size), _everything(points))
+def _splatpipe(
+    name: str, points: ResidentPoints, size: int, *, compact: bool = False
+) -> Iterator[tuple[Callable[[], str], Draw]]:
+    with make_rasterizer(name, points, size, size, PointSize(), None, compact=compact) as rasterizer:
+        yield lambda: rasterizer.device, lambda i: rasterizer.draw(camera_of(i, size, size), everything(points))
 
 
 @contextmanager
@@ -161,16 +176,21 @@ def _vtk(points: ResidentPoints, size: int) -> Iterator[tuple[Callable[[], str],
 
     positions = np.column_stack([points.x, points.y, points.z])
     with VtkPoints(positions, points.colour, size, size) as window:
-        yield lambda: window.device, lambda i: window.draw(_camera(i, size), _pose(i), _FOV_Y_RAD)
+        yield lambda: window.device, lambda i: window.draw(camera_of(i, size, size), _pose(i), _FOV_Y_RAD)
 
 
 @contextmanager
 def _numpy(points: ResidentPoints, size: int) -> Iterator[tuple[Callable[[], str], Draw]]:
-    yield lambda: f"NumPy {np.__version__}", lambda i: reference_frame(points, _camera(i, size), _everything(points))
+    yield (
+        lambda: f"NumPy {np.__version__}",
+        lambda i: reference_frame(points, camera_of(i, size, size), everything(points)),
+    )
 
 
 _CONTESTANTS: dict[str, Contestant] = {
-    **{name: partial(_splatpipe, name) for name in ("cpu", "gl", "gl-points")},
+    "cpu": partial(_splatpipe, "cpu"),
+    "cpu compact": partial(_splatpipe, "cpu", compact=True),
+    **{name: partial(_splatpipe, name) for name in ("gl", "gl-points")},
     "vtk": _vtk,
     "numpy": _numpy,
 }
@@ -182,24 +202,27 @@ def _pose(frame: int) -> np.ndarray:
     return look_at(eye, np.zeros(3), np.array([0.0, 1.0, 0.0]))
 
 
-def _camera(frame: int, size: int) -> Camera:
+def camera_of(frame: int, width: int, height: int) -> Camera:
+    """The camera of a frame; it moves between frames."""
     return perspective_camera(
-        frame=frame, world_from_camera=_pose(frame), fov_y_rad=_FOV_Y_RAD, width=size, height=size, near=0.01
+        frame=frame, world_from_camera=_pose(frame), fov_y_rad=_FOV_Y_RAD, width=width, height=height, near=0.01
     )
 
 
-def _within_one_pixel(surface: np.ndarray, size: int) -> np.ndarray:
+def _within_one_pixel(surface: np.ndarray, camera: Camera) -> np.ndarray:
     """The surface shrunk into the middle of the pixel right of and below the image's centre."""
-    pixel = _DISTANCE / _camera(0, size).focal_px
+    pixel = _DISTANCE / camera.focal_px
     return surface * (0.1 * pixel) + np.array([0.5 * pixel, -0.5 * pixel, 0.0])
 
 
-def _resident(positions: np.ndarray, colour: np.ndarray) -> ResidentPoints:
+def _resident(positions: np.ndarray, colour: np.ndarray, block_points: int) -> ResidentPoints:
     x, y, z = (np.ascontiguousarray(column, np.float32) for column in positions.T)
-    return ResidentPoints(x, y, z, colour, np.zeros(1, np.int64), np.zeros((1, 3)))
+    first = np.arange(0, len(x), block_points)
+    return ResidentPoints(x, y, z, colour, first, np.zeros((len(first), 3)))
 
 
-def _everything(points: ResidentPoints) -> np.ndarray:
+def everything(points: ResidentPoints) -> np.ndarray:
+    """(1,) RENDER_POINT, all points."""
     return np.array([(0, len(points), 1)], RENDER_POINT)
 
 
@@ -211,24 +234,28 @@ def _rgb(frame: np.ndarray) -> np.ndarray:
     return colour[..., None].view(np.uint8)[..., :3]
 
 
-def _read_times(points: ResidentPoints, repeats: int) -> list[float]:
-    """Seconds to read every byte of the points once with all threads: no rasterizer can be faster."""
-    columns = [column.view(np.uint32) for column in (points.x, points.y, points.z, points.colour)]
+def read_times(columns: Sequence[np.ndarray], repeats: int) -> list[float]:
+    """Seconds to read every byte of 4-byte columns once with all threads: no rasterizer can be faster."""
+    words = [column.view(np.uint32) for column in columns]
     threads = len(os.sched_getaffinity(0))
-    cuts = [len(points) * i // threads for i in range(threads + 1)]
+
+    def read(i: int) -> None:
+        for column in words:
+            _read(column, len(column) * i // threads, len(column) * (i + 1) // threads)
+
     times = []
     with ThreadPoolExecutor(threads) as executor:
         for _ in range(repeats + 1):
             start = time.perf_counter()
-            list(executor.map(partial(_read, *columns), cuts[:-1], cuts[1:]))
+            list(executor.map(read, range(threads)))
             times.append(time.perf_counter() - start)
     return times[1:]  # the first one compiles
 
 
 @njit(nogil=True, cache=True)
-def _read(x, y, z, colour, begin, end):
-    """Something that depends on every bit of four (n,) uint32 columns, at a cost that memory hides."""
+def _read(column, begin, end):
+    """Something that depends on every bit of a (n,) uint32 column, at a cost that memory hides."""
     mixed = np.uint32(0)
     for i in range(begin, end):
-        mixed ^= x[i] ^ y[i] ^ z[i] ^ colour[i]
+        mixed ^= column[i]
     return mixed
