@@ -13,6 +13,7 @@ import pytest
 from splatpipe.nodes.raster import CellFeatures, ResidentPoints, SplatSettings, gl_resident, gl_splat
 from splatpipe.nodes.raster.gl_context import gl_available
 from splatpipe.nodes.raster.gl_splat import GlSplatRasterizer
+from splatpipe.nodes.raster.splat import CpuSplatRasterizer
 from splatpipe.nodes.raster.splat_reference import splat_frame
 from splatpipe.shared.camera import Camera, look_at, perspective_camera
 from splatpipe.shared.errors import InputError, MessageError
@@ -156,6 +157,13 @@ def test_flat_cells_are_quads_in_the_visibility_pass(points, entries):
     assert_close(found, splat_frame(scene, camera(), entries, settings))
     if entries is ALL:
         assert (found != draw(scene, camera(), entries, SplatSettings())).any()
+
+
+@pytest.mark.parametrize("entries", [ALL, SOME], ids=["all", "some"])
+def test_pictures_are_those_of_cpu(points, entries):
+    scene, settings = with_quads(points), SplatSettings(features=True)
+    with CpuSplatRasterizer(scene, WIDTH, HEIGHT, settings, 2) as cpu:
+        assert_close(draw(scene, camera(), entries, settings), cpu.draw(camera(), entries))
 
 
 def test_chunks_and_batches_do_not_show(points, monkeypatch):
