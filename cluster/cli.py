@@ -347,6 +347,38 @@ def bench_pipeline(
     _report(measure(config, sets or [], repeats), print_pipeline, json)
 
 
+@bench_app.command("lod")
+def bench_lod(
+    points: Annotated[int, typer.Option(help="Number of points of each scene.", min=1000)] = 100_000_000,
+    size: Annotated[str, typer.Option(metavar="WIDTHxHEIGHT", help="Viewport, pixels.")] = "1920x1080",
+    thresholds: Annotated[str, typer.Option(help="Values of sampling.pixel_threshold.")] = "32",
+    densities: Annotated[str, typer.Option(help="Values of sampling.points_per_pixel.")] = "1,1.25,1.5,2,3",
+    frames: Annotated[int, typer.Option(help="Timed frames of each path.", min=1)] = 30,
+    error_frames: Annotated[int, typer.Option(help="Frames of each path compared with all points.", min=1)] = 5,
+    workdir: Annotated[Path, typer.Option(help="Where the scenes are built and kept.")] = Path("bench-lod"),
+    json: JsonOption = None,
+) -> None:
+    """Level of detail over large generated scenes: time, and error against all points, of each setting.
+
+    Example: `splatpipe bench lod --points 10000000 --densities 1,2,4 --json lod.json`
+    """
+    from .bench.lod import bench_lod as measure
+    from .bench.lod import print_lod
+
+    width, height = map(int, parse_numbers(size.replace("x", ","), "--size", 2))
+    results = measure(
+        points,
+        width=width,
+        height=height,
+        thresholds=parse_numbers(thresholds, "--thresholds"),
+        densities=parse_numbers(densities, "--densities"),
+        frames=frames,
+        error_frames=error_frames,
+        workdir=workdir,
+    )
+    _report(results, print_lod, json)
+
+
 def _report(results: dict[str, Any], show: Any, json: Path | None) -> None:
     from rich.console import Console
 
@@ -386,6 +418,17 @@ def _fail(error: BaseException, message: str, status: int) -> None:
         traceback.print_exception(error)
     print("splatpipe: " + " ".join(message.split("\n")), file=sys.stderr)
     sys.exit(status)
+
+
+def parse_numbers(text: str, option: str, count: int | None = None) -> list[float]:
+    """The comma-separated positive numbers of an option. Raises InputError naming it."""
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if not values or not all(0 < value < 2**20 for value in values) or count not in (None, len(values)):
+        raise InputError(f"{option} {text}: expected {count or 'some'} numbers above 0")
+    return values
 
 
 def parse_bytes(text: str, option: str) -> int:

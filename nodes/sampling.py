@@ -33,8 +33,8 @@ class SamplingNode:
     octree : cells in breadth-first order, either point order.
     pixel_threshold : a cell that projects to at most this many pixels across is drawn from its own points, if
         those suffice; 0 draws every visible point.
-    points_per_pixel : points of a set in stratified order, for each pixel that the surface in its cell (``Octree.area``)
-        covers where it is seen face on.
+    points_per_pixel : points of a set in stratified order, for each pixel that the surface in its cell covers where it
+        is seen face on (``Octree.area``).
     Raises ConfigError for a threshold that is not a finite number ≥ 0, or points per pixel that are not one > 0.
     """
 

@@ -11,7 +11,7 @@ RUN_POINTS = 4096
 """Points of a run in ``stored`` order: a full leaf."""
 
 
-def bumpy_sphere(n: int, seed: int = 0) -> np.ndarray:
+def bumpy_sphere(n: int, seed: int | list[int] = 0) -> np.ndarray:
     """(n, 3) float64 points, in random order, on a closed surface around the origin, radius 0.85 … 1.15."""
     direction = np.random.default_rng(seed).standard_normal((n, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
