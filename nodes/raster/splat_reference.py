@@ -43,6 +43,8 @@ class EyeSplats:
 
 
 Window = tuple[slice, slice]
+Fragments = tuple[Window, np.ndarray, np.ndarray, np.ndarray]
+"""A window of the image and, for each pixel there, whether it is covered, depth and weight."""
 
 
 def eye_splats(points: ResidentPoints, camera: Camera, index: np.ndarray, settings: SplatSettings) -> EyeSplats:
@@ -87,26 +89,31 @@ def splat_frame(
     """(height, width) uint64 framebuffer words. Arguments as in ``Rasterizer``; entries are not checked."""
     splats = eye_splats(points, camera, point_indices(entries), settings)
     fragments = [_fragments(splats, i, camera) for i in range(len(splats.index))]
-    in_first_pass = np.ones(len(splats.index), bool)
+    behind = settings.depth_offset * splats.radius
 
     # 1. visibility
     front = np.full((camera.height, camera.width), np.inf)
     if settings.features:
         cells = flat_cells(points.features)
         cell = np.searchsorted(cells.first_point, splats.index, side="right")  # the last one that begins before, or 0
-        in_first_pass = splats.index >= np.append(0, cells.first_point + cells.n_points)[cell]
+        no_quad = splats.index >= np.append(0, cells.first_point + cells.n_points)[cell]
         for i in np.flatnonzero(drawn_cells(cells, entries)):
             _draw_quad(front, camera, cells.quad_center[i], cells.quad_axes[i].astype(np.float64))
-    for i in np.flatnonzero(in_first_pass):
-        window, covered, depth, _ = fragments[i]
-        front[window] = np.where(covered, np.minimum(front[window], depth), front[window])
+        _draw_depths(front, [fragments[i] for i in np.flatnonzero(no_quad)])
+        hidden = np.ones(front.shape, bool)
+        for (window, covered, depth, _), epsilon in zip(fragments, behind, strict=True):
+            hidden[window] &= ~(covered & (depth - epsilon <= front[window]))
+        front[hidden] = np.inf  # quads reach a little beyond their splats: where they hide every one, they do not count
+        _draw_depths(front, fragments, where=hidden)
+    else:
+        _draw_depths(front, fragments)
 
     # 2. colour
     nearest = np.full_like(front, np.inf)
     weight_sum = np.zeros_like(front)
     colour_sum = np.zeros((*front.shape, 3))
-    for (window, covered, depth, weight), radius, colour in zip(fragments, splats.radius, splats.colour, strict=True):
-        accepted = covered & (depth - settings.depth_offset * radius <= front[window])
+    for (window, covered, depth, weight), epsilon, colour in zip(fragments, behind, splats.colour, strict=True):
+        accepted = covered & (depth - epsilon <= front[window])
         nearest[window] = np.where(accepted, np.minimum(nearest[window], depth), nearest[window])
         weight_sum[window] += np.where(accepted, weight, 0)
         colour_sum[window] += np.where(accepted, weight, 0)[:, :, None] * colour
@@ -120,7 +127,7 @@ def splat_frame(
     return words
 
 
-def _fragments(splats: EyeSplats, i: int, camera: Camera) -> tuple[Window, np.ndarray, np.ndarray, np.ndarray]:
+def _fragments(splats: EyeSplats, i: int, camera: Camera) -> Fragments:
     """Of splat i: its window of the image and, for each pixel there, whether it is covered, depth and weight."""
     frame = EyeFrame.of(camera)
     p, normal, radius = splats.center[i], splats.normal[i], splats.radius[i]
@@ -136,6 +143,13 @@ def _fragments(splats: EyeSplats, i: int, camera: Camera) -> tuple[Window, np.nd
     screen = _dot(pixel - place, pixel - place) / SCREEN_RADIUS_PX**2
     rho_2 = np.minimum(disc, screen)
     return window, rho_2 <= 1, np.where(disc < screen, t, p[2]), np.exp(-FALLOFF * rho_2)
+
+
+def _draw_depths(front: np.ndarray, fragments: list[Fragments], where: np.ndarray | None = None) -> None:
+    """Take the minimum of depths and those of fragments, everywhere or where a mask is set."""
+    for window, covered, depth, _ in fragments:
+        drawn = covered if where is None else covered & where[window]
+        front[window] = np.where(drawn, np.minimum(front[window], depth), front[window])
 
 
 def _draw_quad(front: np.ndarray, camera: Camera, center: np.ndarray, axes: np.ndarray) -> None:

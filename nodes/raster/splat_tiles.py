@@ -105,30 +105,61 @@ def draw_tiles(splats, quads, near, n_across, lanes, planes, frame, counter):
         if begin < end:
             for i in range(PLANES * _PIXELS):
                 planes[i] = _INF if i < 2 * _PIXELS else _ZERO
+            has_quads = quad_first[tile] < quad_first[tile + 1]
             for k in range(quad_first[tile], quad_first[tile + 1]):
                 i = np.uintp(quad_lists[k])
                 _cover_quad(quad_records[i], quad_bounds[i], left, top, near, planes)
-            farthest[:] = _INF
-            for k in range(begin, end):
-                if (k - begin) % LOOK_BACK == LOOK_BACK - 1:
-                    _find_farthest(planes, farthest)
-                i = np.uintp(lists[k])
-                if records[i].visible and not _hidden(records[i].nearest, bounds[i], left, top, farthest):
-                    if records[i].is_disc:
-                        _cover_disc(records[i], bounds[i], left, top, lanes, near, planes)
-                    else:
-                        _cover_dot(records[i], bounds[i], left, top, lanes, planes)
-            _find_farthest(planes, farthest)
-            for k in range(begin, end):
-                i = np.uintp(lists[k])
-                if _hidden(records[i].nearest - records[i].behind, bounds[i], left, top, farthest):
-                    continue
-                if records[i].is_disc:
-                    _add_disc(records[i], bounds[i], left, top, lanes, near, planes)
-                else:
-                    _add_dot(records[i], bounds[i], left, top, lanes, planes)
+            _see(records, bounds, lists, begin, end, left, top, near, lanes, planes, farthest, False)
+            _add(records, bounds, lists, begin, end, left, top, near, lanes, planes, farthest)
+            if has_quads and _reopen(planes):
+                _see(records, bounds, lists, begin, end, left, top, near, lanes, planes, farthest, True)
+                _add(records, bounds, lists, begin, end, left, top, near, lanes, planes, farthest)
         _normalise(planes, begin == end, left, top, frame)
         tile = _fetch_add(counter, 1)
+
+
+@njit(nogil=True, cache=True)
+def _see(records, bounds, lists, begin, end, left, top, near, lanes, planes, farthest, everything):
+    """Visibility pass of a tile: of ``everything``, or of what no quad stands for."""
+    for k in range(begin, end):
+        if (k - begin) % LOOK_BACK == 0:
+            _find_farthest(planes, farthest)
+        i = np.uintp(lists[k])
+        if not (everything or records[i].visible) or _hidden(records[i].nearest, bounds[i], left, top, farthest):
+            continue
+        if records[i].is_disc:
+            _cover_disc(records[i], bounds[i], left, top, lanes, near, planes)
+        else:
+            _cover_dot(records[i], bounds[i], left, top, lanes, planes)
+
+
+@njit(nogil=True, cache=True)
+def _add(records, bounds, lists, begin, end, left, top, near, lanes, planes, farthest):
+    """Colour pass of a tile."""
+    _find_farthest(planes, farthest)
+    for k in range(begin, end):
+        i = np.uintp(lists[k])
+        if _hidden(records[i].nearest - records[i].behind, bounds[i], left, top, farthest):
+            continue
+        if records[i].is_disc:
+            _add_disc(records[i], bounds[i], left, top, lanes, near, planes)
+        else:
+            _add_dot(records[i], bounds[i], left, top, lanes, planes)
+
+
+@njit(nogil=True, cache=True)
+def _reopen(planes):
+    """Whether there are pixels where a quad hides every splat: it reaches a little beyond its own ones.
+
+    They are opened for both passes once more, the others closed.
+    """
+    found = False
+    for k in range(_PIXELS):
+        i = np.uintp(k)
+        reopened = planes[i + _WEIGHT] == _ZERO and planes[i] < _INF
+        planes[i] = _INF if reopened else -_INF
+        found |= reopened
+    return found
 
 
 @njit(nogil=True, cache=True)
