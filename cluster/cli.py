@@ -107,15 +107,18 @@ def synth(
     output: Annotated[Path, typer.Argument(help="Scene directory, or a file ending in .las or .laz.")],
     points: Annotated[int, typer.Option(help="Number of points.", min=1)] = 2_000_000,
     seed: Annotated[int, typer.Option(help="Another seed, another city.")] = 1,
+    splats: Annotated[bool, typer.Option("--splats", help="As for `splatpipe build`.")] = False,
+    features: Annotated[bool, typer.Option("--features", help="As for `splatpipe build`.")] = False,
     overwrite: Annotated[bool, typer.Option(help="Replace an existing scene.")] = False,
 ) -> None:
     """Make a synthetic city scan: a scene directory, or a LAS/LAZ file.
 
     Example: `splatpipe synth city.scene --points 2000000`
     """
+    from ..shared.build import BuildSettings
     from .scenes import synth_command
 
-    synth_command(output, points, seed, overwrite)
+    synth_command(output, points, seed, BuildSettings(overwrite=overwrite, up="z", splats=splats, features=features))
 
 
 @app.command()
@@ -311,6 +314,25 @@ def bench_raster(
     from .bench.raster import print_raster
 
     _report(measure(n_points=points, size=size, repeats=repeats), print_raster, json)
+
+
+@bench_app.command("splats")
+def bench_splats(
+    scenes: Annotated[list[Path], typer.Argument(help="Scenes built with --features.")],
+    size: Annotated[int, typer.Option(help="Width and height, pixels.", min=16, max=8192)] = 1024,
+    views: Annotated[int, typer.Option(help="Views from all around.", min=1)] = 4,
+    repeats: Annotated[int, typer.Option(help="Timed frames of each view and way.", min=1)] = 7,
+    pictures: Annotated[Path | None, typer.Option(help="Folder for pictures side by side.")] = None,
+    json: JsonOption = None,
+) -> None:
+    """Thesis Table 4-4: feature-driven against normal visibility splatting, and holes of points and splats.
+
+    Example: `splatpipe bench splats dragon.scene buddha.scene --pictures splats`
+    """
+    from .bench.splats import bench_splats as measure
+    from .bench.splats import print_splats
+
+    _report(measure(scenes, size=size, views=views, repeats=repeats, pictures=pictures), print_splats, json)
 
 
 @bench_app.command("build")

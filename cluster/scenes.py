@@ -27,18 +27,18 @@ def build_command(inputs: list[str], output: Path, settings: BuildSettings, json
     _build([open_source(path) for path in expand_inputs(inputs)], output, settings, json)
 
 
-def synth_command(output: Path, n_points: int, seed: int, overwrite: bool) -> None:
+def synth_command(output: Path, n_points: int, seed: int, settings: BuildSettings) -> None:
     """``splatpipe synth``: a scene, or a file where the name ends in .las or .laz."""
     from ..shared.synth import CityScan, write_las
 
     city = CityScan(n_points=n_points, seed=seed)
     if output.suffix.lower() in (".las", ".laz"):
-        if output.exists() and not overwrite:
+        if output.exists() and not settings.overwrite:
             raise InputError(f"{output}: exists already; --overwrite replaces it")
         write_las(city, output)
         _console.print(f"wrote {output}: {n_points:,} points")
     else:
-        _build([city], output, BuildSettings(overwrite=overwrite, up="z"), None)
+        _build([city], output, settings, None)
 
 
 def _build(sources: list[Any], output: Path, settings: BuildSettings, json: Path | None) -> None:
@@ -87,7 +87,9 @@ def _scene_info(path: Path) -> dict[str, Any]:
     size = sum(array["bytes"] for array in info.pop("arrays").values())
     info["splats"] = scene.info.splats
     if scene.info.features:
-        count = np.bincount(scene.octree(features=True).feature, minlength=len(FEATURES))
+        feature = scene.octree(features=True).feature
+        assert feature is not None
+        count = np.bincount(feature, minlength=len(FEATURES))
         info["features"] = [f"{n:,} {name}" for name, n in zip(FEATURES, count, strict=True)]
     info["sources"] = [f"{source['name']} ({source['n_points']:,})" for source in info["sources"]]
     return {"scene": str(path), **info, "bytes": size}

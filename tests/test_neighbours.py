@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from splatpipe.shared.build import BuildSettings, build_scene, builder, neighbours
 from splatpipe.shared.build.morton import keys_of, root_cube
 from splatpipe.shared.build.neighbours import SurfaceRule, add_surface, distinct, plane_normals, splat_radii
@@ -74,7 +74,7 @@ def reference_radius(points):
 def test_kernels_equal_their_twins(seed, scale, n):
     rng = np.random.default_rng(seed)
     points = rng.normal(size=(n, 3)) * rng.choice([1.0, 0.1, 1e-3], 3) * scale
-    distance, near = cKDTree(points).query(points, k=range(1, 10))
+    distance, near = map(np.asarray, KDTree(points).query(points, k=9))
     normals = plane_normals(points, near, True, np.zeros(3))
     radii = splat_radii(points, np.ascontiguousarray(near[:, 1:]), distance[:, 1:])
     for i in range(n):
@@ -126,7 +126,7 @@ def test_discs_leave_no_hole(surface):
     positions, _ = surface(20_000, rng)
     radii = surface_of(positions)[1]
     anywhere, _ = surface(100_000, rng)
-    distance, near = cKDTree(positions).query(anywhere, k=12)
+    distance, near = map(np.asarray, KDTree(positions).query(anywhere, k=12))
     if surface is plane:
         distance = distance[np.abs(anywhere[:, :2] - 0.5).max(axis=1) < 0.49]
         near = near[np.abs(anywhere[:, :2] - 0.5).max(axis=1) < 0.49]
@@ -266,7 +266,7 @@ def test_builds_larger_than_memory_leave_no_hole_either(tmp_path, monkeypatch, p
         radii[number] = radius_table(scene.info.edge)[np.asarray(scene.attribute("radius"))[own]]
         normals = unpack_normals(np.asarray(scene.attribute("normal"))[own])
         assert np.mean(angle_deg(normals.astype(float), outward[number])) < 1.5
-        distance, near = cKDTree(positions).query(anywhere, k=20)
+        distance, near = map(np.asarray, KDTree(positions).query(anywhere, k=20))
         assert (distance > radii[near]).all(axis=1).mean() < (1e-4 if max_depth else 2e-3)
         assert np.mean(radii) < 1.2 * np.mean(surface_of(positions)[1])
     assert inside.info.edge == scene.info.edge

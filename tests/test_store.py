@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -147,6 +148,64 @@ def test_scene_file_that_is_no_json_object(scene, text):
         Scene.open(scene)
 
 
+def test_scene_of_version_1_opens(tmp_path):
+    """A scene of three points in one cell, as the first version wrote it."""
+    arrays = {
+        "cell_level": np.zeros(1, "u1"),
+        "cell_code": np.zeros(1, "<u8"),
+        "cell_parent": np.full(1, -1, "<i4"),
+        "cell_first_child": np.full(1, -1, "<i4"),
+        "cell_n_children": np.zeros(1, "u1"),
+        "cell_first_point": np.zeros(1, "<i8"),
+        "cell_n_points": np.full(1, 3, "<i8"),
+        "cell_n_below": np.full(1, 3, "<i8"),
+        "x": np.array([-0.5, 0.0, 0.5], "<f4"),
+        "y": np.zeros(3, "<f4"),
+        "z": np.zeros(3, "<f4"),
+        "attr_rgb": np.full(3, 0xFF808080, "<u4"),
+        "block_first_point": np.zeros(1, "<i8"),
+        "block_origin": np.array([[0.5, 0.5, 0.5]]),
+    }
+    for name, array in arrays.items():
+        np.save(tmp_path / f"{name}.npy", array)
+    content = {
+        "point_order": "layered",
+        "origin": [0.0, 0.0, 0.0],
+        "edge": 1.0,
+        "lower": [0.0, 0.5, 0.5],
+        "upper": [1.0, 0.5, 0.5],
+        "n_points": 3,
+        "n_stored": 3,
+        "n_cells": 1,
+        "n_blocks": 1,
+        "n_dropped": 0,
+        "attributes": ["rgb"],
+        "block_levels": 0,
+        "up": "z",
+        "crs": None,
+        "sources": [{"name": "cloud.npy", "n_points": 3}],
+        "build": {},
+        "arrays": {
+            name: {
+                "dtype": array.dtype.str,
+                "shape": list(array.shape),
+                "bytes": array.nbytes,
+                "crc32": zlib.crc32(array.tobytes()),
+            }
+            for name, array in arrays.items()
+        },
+        "format_version": 1,
+    }
+    (tmp_path / "scene.json").write_text(json.dumps(content))
+    scene = Scene.open(tmp_path)
+    scene.verify()
+    assert (scene.info.features, scene.info.splats) == (False, False)
+    assert scene.octree().n_points.tolist() == [3]
+    edit_json(tmp_path, format_version=2)
+    with pytest.raises(StoreError, match=r"scene\.json: features not found"):
+        Scene.open(tmp_path)
+
+
 def test_not_a_scene(tmp_path):
     for path in (tmp_path, tmp_path / "nothing"):
         with pytest.raises(StoreError, match="not a scene"):
@@ -158,8 +217,6 @@ def test_not_a_scene(tmp_path):
 )
 def test_links_that_do_not_hold_together_are_named(scene, array):
     """With checksums made to fit: what a faulty writer would leave."""
-    import zlib
-
     file = scene / f"cell_{array}.npy"
     values = np.load(file)
     rng = np.random.default_rng(3)
@@ -176,8 +233,6 @@ def test_links_that_do_not_hold_together_are_named(scene, array):
 
 
 def test_a_point_outside_its_cell_is_found(scene):
-    import zlib
-
     x = np.load(scene / "x.npy")
     x[777] += 60
     np.save(scene / "x.npy", x)

@@ -150,6 +150,8 @@ def _quad(points, reach, mean, vectors, quad):
             off[i] += (points[i, axis] - mean[axis]) * vectors[axis, 0]
     height = (off.min() + off.max()) / 2
     radius = reach.mean()
+    if not radius > 0.0:
+        return False
     u, v = np.empty(n), np.empty(n)
     for i in range(n):
         if abs(off[i] - height) > FLAT_DEVIATION * reach[i]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from ..points import PointBatch, pack_normals, pack_radii
 from .eigen import sorted_eigen
@@ -68,13 +68,14 @@ def add_surface(
     The same for any number of threads. Cost: about 2 µs a point and thread.
     """
     order, first = distinct(points.positions, keys)
-    positions = points.positions[order[first]] - rule.origin
-    tree = cKDTree(positions, balanced_tree=False, compact_nodes=False)
+    positions = points.positions[order[first]]
+    positions -= rule.origin
+    tree = KDTree(positions, balanced_tree=False, compact_nodes=False)
     toward = rule.center - rule.origin if rule.up is None else rule.up
     normal, radius = np.empty(len(first), np.uint32), np.empty(len(first), np.uint8)
 
     def search(begin: int, end: int) -> None:
-        distance, neighbour = tree.query(positions[begin:end], k=range(1, rule.n_neighbours + 2))
+        distance, neighbour = map(np.asarray, tree.query(positions[begin:end], k=rule.n_neighbours + 1))
         if rule.normals:
             normal[begin:end] = pack_normals(plane_normals(positions, neighbour, rule.up is None, toward))
         if rule.radii:
