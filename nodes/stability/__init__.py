@@ -8,6 +8,7 @@ module          owns
 ``extents``     clouds of any extent
 ``depth``       near and far, points on and behind the camera
 ``clouds``      degenerate clouds: coincident, collinear, one hot octant, …
+``compact``     positions in fixed point
 ``viewports``   pixel borders and the smallest and largest images
 ``large``       more points than 32 bits count
 ==============  ===============================================================

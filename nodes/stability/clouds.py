@@ -51,7 +51,7 @@ _ORDERS = ("layered", "depth-first")
 _EVERY = dict.fromkeys(CLOUDS, 0.0)
 
 
-def _cameras(positions: np.ndarray) -> list:
+def cameras_of(positions: np.ndarray) -> list:
     """From outside, and from 1/10 of its extent beside a point of the cloud."""
     lower, upper = positions.min(axis=0), positions.max(axis=0)
     extent = max(float((upper - lower).max()), 1e-6)
@@ -76,7 +76,7 @@ def drawn(name: str) -> float:
             entries = chain.leaf_entries
             stored = np.concatenate([chain.source[o : o + r] for o, r, _ in entries.tolist()])
             expect(np.array_equal(np.sort(stored), np.arange(len(positions))), "every point is in one leaf, once")
-            cameras = _cameras(positions)
+            cameras = cameras_of(positions)
             expect(is_drawn(chain.frame(cameras[0])).any(), "the picture shows something")
             wrong += sum(map(chain.differing_pixels, cameras))
     return wrong
@@ -87,7 +87,7 @@ def projected(name: str) -> float:
     """Image position of every drawn point, from outside and from within, against float64 of the points as given."""
     positions = CLOUDS[name]()
     with built(positions) as chain:
-        moved = np.concatenate([chain.moved_steps(camera) for camera in _cameras(positions)])
+        moved = np.concatenate([chain.moved_steps(camera) for camera in cameras(positions)])
         expect(len(moved), "points are in the image")
         return float(moved.max())
 
@@ -99,7 +99,7 @@ def cut(name: str) -> float:
     wrong = 0
     for order in _ORDERS:
         with built(positions, order=order) as chain:
-            cameras = _cameras(positions)
+            cameras = cameras_of(positions)
             expect(chain.chosen(cameras[0]).n_points, "a cell is visible")
             for camera in cameras:
                 for threshold in (0.0, 1.0, 30.0):

@@ -58,7 +58,7 @@ def beside_the_border() -> float:
 
 @cases(
     "viewport/size",
-    bounds=dict.fromkeys(("1×1", f"1×{MAX_SIDE_PX}", f"{MAX_SIDE_PX}×1", "16384×4096"), 0.0),
+    bounds=dict.fromkeys(("1×1", f"1×{MAX_SIDE_PX}", f"{MAX_SIDE_PX}×1", "16384×16384"), 0.0),
     unit="pixels",
 )
 def size(name: str) -> float:
