@@ -84,8 +84,9 @@ class GlSplatRasterizer(GlResident):
             )
             for one in ("PASS_VISIBILITY", "PASS_COLOUR")
         )
-        self._division = context.program(
-            vertex_shader=shader_source("whole.vert"), fragment_shader=shader_source("words.frag")
+        self._division, self._reopening = (
+            context.program(vertex_shader=shader_source("whole.vert"), fragment_shader=shader_source(one))
+            for one in ("words.frag", "reopen.frag")
         )
         self._set_constants()
         self._front, self._weights = (context.texture(size, 1, dtype="f4") for _ in range(2))
@@ -95,7 +96,7 @@ class GlSplatRasterizer(GlResident):
         self._words_target = context.framebuffer([self._words])
         self._strips = {
             program: context.vertex_array(program, [], mode=moderngl.TRIANGLE_STRIP)
-            for program in (self._visibility, self._colour, self._division)
+            for program in (self._visibility, self._colour, self._division, self._reopening)
         }
         if self._settings.features:
             self._quads = self._buffer(bytes=_QUAD_BYTES << 4, what="quads")
@@ -119,6 +120,8 @@ class GlSplatRasterizer(GlResident):
         colour["depth_offset"] = min(self._settings.depth_offset, _FLOAT_MAX)
         colour["falloff"] = FALLOFF
         colour["front"] = 0
+        colour["everything"] = True
+        self._reopening["weights"] = 0
         self._division["sums"], self._division["weights"] = 0, 1
 
     def _marks(self, segment: np.ndarray) -> np.ndarray | int:
@@ -140,39 +143,55 @@ class GlSplatRasterizer(GlResident):
 
         context = self._context
         self._set_camera(camera)
-        context.enable_only(moderngl.BLEND)
         context.blend_func = moderngl.ONE, moderngl.ONE
+        self._sums_target.use()
+        self._sums_target.clear(alpha=_FLOAT_MAX)
         self._front_target.use()
         self._front_target.clear(red=_FLOAT_MAX)
+        context.enable_only(moderngl.BLEND)
         context.blend_equation = moderngl.MIN, moderngl.MIN
-        if self._settings.features:
-            self._draw_quads(camera, entries)
+        has_quads = self._settings.features and self._draw_quads(camera, entries)
+        self._draw_both_passes(batches, everything=not has_quads)
+        if has_quads:
+            self._draw_whole(self._reopening, self._front_target, self._weights)
+            self._draw_both_passes(batches, everything=True)
+        self._draw_whole(self._division, self._words_target, self._sums, self._weights)
+        self._words.read_into(self._image)
+        return self._image
+
+    def _draw_both_passes(self, batches: list[Batch], *, everything: bool) -> None:
+        """Visibility, of everything or of what no quad stands for, then colour."""
+        import moderngl
+
+        context = self._context
+        context.enable_only(moderngl.BLEND)
+        self._visibility["everything"] = everything
+        self._front_target.use()
+        context.blend_equation = moderngl.MIN, moderngl.MIN
         for batch in batches:
             self._make_splats(batch)
             self._strips[self._visibility].render(vertices=4, instances=batch.n_units)
-
         self._sums_target.use()
-        self._sums_target.clear(alpha=_FLOAT_MAX)
-        context.blend_equation = moderngl.FUNC_ADD, moderngl.MIN  # of colours and weights; of the depth
         self._front.use(0)
+        context.blend_equation = moderngl.FUNC_ADD, moderngl.MIN  # of colours and weights; of the depth
         for batch in batches:
             if len(batches) > 1:
                 self._make_splats(batch)
             self._strips[self._colour].render(vertices=4, instances=batch.n_units)
 
-        context.enable_only(moderngl.NOTHING)
-        self._words_target.use()
-        self._sums.use(0)
-        self._weights.use(1)
-        self._strips[self._division].render(vertices=3)
-        self._words.read_into(self._image)
-        return self._image
+    def _draw_whole(self, program: moderngl.Program, target: moderngl.Framebuffer, *textures: moderngl.Texture) -> None:
+        """Run a program on every pixel of a target."""
+        import moderngl
+
+        self._context.enable_only(moderngl.NOTHING)
+        target.use()
+        for unit, texture in enumerate(textures):
+            texture.use(unit)
+        self._strips[program].render(vertices=3)
 
     def _set_camera(self, camera: Camera) -> None:
         frame = EyeFrame.of(camera)
-        programs: list[moderngl.Program | moderngl.ComputeShader]
-        programs = [self._maker, *(p for p in self._strips if p is not self._division)]
-        for program in programs:
+        for program in (self._maker, *self._strips):
             values = {"viewport": self._shape[::-1], "focal": tuple(frame.focal), "center": tuple(frame.center)}
             for name, value in {**values, "near": camera.near}.items():
                 if name in program:  # a compiler leaves out what a program does not use
@@ -185,10 +204,11 @@ class GlSplatRasterizer(GlResident):
         self._dispatch(self._maker, batch)
         self._context.memory_barrier()
 
-    def _draw_quads(self, camera: Camera, entries: np.ndarray) -> None:
+    def _draw_quads(self, camera: Camera, entries: np.ndarray) -> bool:
+        """Draw the quads of the flat cells that the entries draw; whether there are any."""
         drawn = drawn_cells(self._flat, entries)
         if not drawn.any():
-            return
+            return False
         frame = EyeFrame.of(camera)
         quads = np.zeros((int(drawn.sum()), 3, 4), np.float32)
         quads[:, 0, :3] = frame.eye_from_blocks(camera, self._flat.quad_center[drawn])
@@ -196,3 +216,4 @@ class GlSplatRasterizer(GlResident):
         self._quads = self._write(self._quads, quads, "quads")
         self._quads.bind_to_storage_buffer(_SPLATS)
         self._strips[self._quad_program].render(vertices=4, instances=len(quads))
+        return True

@@ -8,6 +8,7 @@ flat in vec3 rgb;
 uniform sampler2D front;
 uniform float depth_offset;  // radii
 uniform float falloff;
+const float MOST_OFFSET = 1e38;  // closed pixels stay closed: see reopen.frag.glsl
 layout(location = 0) out vec4 sum;  // weight · colour, depth
 layout(location = 1) out float weight;
 #else
@@ -30,7 +31,7 @@ void main() {
     float depth = nearer ? t : w;
     if (!(rho_2 <= 1.0)) discard;
 #ifdef PASS_COLOUR
-    precise float least = depth - depth_offset * radius;
+    precise float least = depth - min(depth_offset * radius, MOST_OFFSET);
     if (least > texelFetch(front, ivec2(gl_FragCoord.xy), 0).r) discard;
     weight = exp(-falloff * rho_2);
     sum = vec4(weight * rgb, depth);
