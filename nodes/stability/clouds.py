@@ -87,7 +87,7 @@ def projected(name: str) -> float:
     """Image position of every drawn point, from outside and from within, against float64 of the points as given."""
     positions = CLOUDS[name]()
     with built(positions) as chain:
-        moved = np.concatenate([chain.moved_steps(camera) for camera in cameras(positions)])
+        moved = np.concatenate([chain.moved_steps(camera) for camera in cameras_of(positions)])
         expect(len(moved), "points are in the image")
         return float(moved.max())
 
