@@ -51,7 +51,7 @@ class UnitCosts:
     box_s: float = 4e-9
     compact_s: float = 12e-9
     spacing_s: float = 12e-6
-    splat_s: float = 60e-9
+    splat_s: float = 300e-9
     edl_s: float = 28e-9
     average_s: float = 15e-9
     depth_s: float = 11e-9
