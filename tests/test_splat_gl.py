@@ -166,6 +166,13 @@ def test_pictures_are_those_of_cpu(points, entries):
         assert_close(draw(scene, camera(), entries, settings), cpu.draw(camera(), entries))
 
 
+def test_features_without_a_flat_cell_change_nothing(points):
+    scene = with_quads(points)
+    none = replace(scene, features=replace(scene.features, feature=np.full_like(scene.features.feature, 2)))
+    expected = draw(points, camera(), ALL, SplatSettings())
+    np.testing.assert_array_equal(draw(none, camera(), ALL, SplatSettings(features=True)), expected)
+
+
 def test_chunks_and_batches_do_not_show(points, monkeypatch):
     scene, settings = with_quads(points), SplatSettings(features=True)
     expected = draw(scene, camera(), ALL, settings)

@@ -84,10 +84,8 @@ class GlSplatRasterizer(GlResident):
             )
             for one in ("PASS_VISIBILITY", "PASS_COLOUR")
         )
-        self._division, self._reopening = (
-            context.program(vertex_shader=shader_source("whole.vert"), fragment_shader=shader_source(one))
-            for one in ("words.frag", "reopen.frag")
-        )
+        whole = shader_source("whole.vert")
+        self._division = context.program(vertex_shader=whole, fragment_shader=shader_source("words.frag"))
         self._set_constants()
         self._front, self._weights = (context.texture(size, 1, dtype="f4") for _ in range(2))
         self._sums, self._words = context.texture(size, 4, dtype="f4"), context.texture(size, 2, dtype="u4")
@@ -96,7 +94,7 @@ class GlSplatRasterizer(GlResident):
         self._words_target = context.framebuffer([self._words])
         self._strips = {
             program: context.vertex_array(program, [], mode=moderngl.TRIANGLE_STRIP)
-            for program in (self._visibility, self._colour, self._division, self._reopening)
+            for program in (self._visibility, self._colour, self._division)
         }
         if self._settings.features:
             self._quads = self._buffer(bytes=_QUAD_BYTES << 4, what="quads")
@@ -104,9 +102,10 @@ class GlSplatRasterizer(GlResident):
                 vertex_shader=shader_source("splats", "quads.vert"),
                 fragment_shader=shader_source("splats", "quads.frag"),
             )
-            self._strips[self._quad_program] = context.vertex_array(
-                self._quad_program, [], mode=moderngl.TRIANGLE_STRIP
-            )
+            self._reopening = context.program(vertex_shader=whole, fragment_shader=shader_source("reopen.frag"))
+            self._reopening["weights"] = 0
+            for program in (self._quad_program, self._reopening):
+                self._strips[program] = context.vertex_array(program, [], mode=moderngl.TRIANGLE_STRIP)
         self._image = np.empty(self._shape, np.uint64)
 
     def _set_constants(self) -> None:
@@ -121,15 +120,14 @@ class GlSplatRasterizer(GlResident):
         colour["falloff"] = FALLOFF
         colour["front"] = 0
         colour["everything"] = True
-        self._reopening["weights"] = 0
         self._division["sums"], self._division["weights"] = 0, 1
 
     def _marks(self, segment: np.ndarray) -> np.ndarray | int:
         if not self._settings.features:
             return 0
         first, flat = self._segment_first[segment], self._flat
-        cell = np.searchsorted(flat.first_point, first, side="right") - 1
-        return np.where((cell >= 0) & (first < (flat.first_point + flat.n_points)[cell]), _HAS_QUAD, 0)
+        cell = np.searchsorted(flat.first_point, first, side="right")  # the last one that begins before, or 0
+        return np.where(first < np.append(0, flat.first_point + flat.n_points)[cell], _HAS_QUAD, 0)
 
     def _block_rows(self, camera: Camera, blocks: np.ndarray) -> np.ndarray:
         frame = EyeFrame.of(camera)
