@@ -12,6 +12,7 @@ The largest of them limits the frame: parts overlap at best, and add up at worst
 
 from __future__ import annotations
 
+import itertools
 import os
 import time
 from collections.abc import Callable
@@ -29,7 +30,7 @@ from ...nodes.raster.cpu import CpuRasterizer
 from ...shared.camera import Camera
 from ...shared.messages import FRAMEBUFFER_EMPTY
 from ..record import machine_record, spread_ms
-from .raster import bench_cases, camera_of, everything, read_times
+from .raster import bench_cases, camera_of, everything, read_share
 
 SIZES = ((512, 512), (1024, 1024), (1920, 1080), (3840, 2160))
 """Widths and heights of the images."""
@@ -47,14 +48,9 @@ def bench_roofline(n_points: int = 4_000_000, repeats: int = 15) -> dict[str, An
             for order, points in bench_cases(n_points, camera_of(0, width, height)):
                 for compact in (False, True):
                     parts = _Parts(points, camera_of(0, width, height), compact, executor, threads)
-                    frame_s = _frame_times(points, width, height, compact, repeats)
-                    part_s = {
-                        "read": read_times(parts.columns_read, repeats),
-                        "project": parts.project_times(repeats),
-                        "scatter": parts.scatter_times(repeats),
-                        "merge": parts.merge_times(repeats),
-                    }
-                    median_s = {part: float(np.median(times)) for part, times in part_s.items()}
+                    times = _times(points, parts, repeats)
+                    median_s = {part: float(np.median(times[part])) for part in times}
+                    frame_s = median_s.pop("frame")
                     rows.append(
                         {
                             "width": width,
@@ -62,10 +58,10 @@ def bench_roofline(n_points: int = 4_000_000, repeats: int = 15) -> dict[str, An
                             "order": order,
                             "positions": "compact" if compact else "float32",
                             "bytes_per_point": parts.bytes_per_point,
-                            "ms": spread_ms(frame_s),
-                            "points_per_s": n_points / float(np.median(frame_s)),
-                            "share_of_read_limit": median_s["read"] / float(np.median(frame_s)),
-                            "parts_ms": {part: spread_ms(times) for part, times in part_s.items()},
+                            "ms": spread_ms(times["frame"]),
+                            "points_per_s": n_points / frame_s,
+                            "share_of_read_limit": median_s["read"] / frame_s,
+                            "parts_ms": {part: spread_ms(times[part]) for part in median_s},
                             "limit": max(median_s, key=lambda part: median_s[part]),
                         }
                     )
@@ -105,15 +101,25 @@ def print_roofline(results: dict[str, Any], console: Any) -> None:
     console.print(f"{machine['cpu']}, {machine['cores']} cores, commit {machine['commit'] or 'unknown'}")
 
 
-def _frame_times(points: ResidentPoints, width: int, height: int, compact: bool, repeats: int) -> list[float]:
-    times = []
-    with CpuRasterizer(points, width, height, compact=compact) as rasterizer:
-        for frame in range(repeats + 2):
-            camera = camera_of(frame, width, height)
-            start = time.perf_counter()
-            rasterizer.draw(camera, everything(points))
-            times.append(time.perf_counter() - start)
-    return times[2:]
+def _times(points: ResidentPoints, parts: _Parts, repeats: int) -> dict[str, list[float]]:
+    """Seconds of a frame and of each part, taken in turn, so that what disturbs the machine disturbs all of them."""
+    width, height = parts.camera.width, parts.camera.height
+    with CpuRasterizer(points, width, height, compact=parts.compact) as rasterizer:
+        numbers = itertools.count()
+        work = {
+            "frame": lambda: rasterizer.draw(camera_of(next(numbers), width, height), everything(points)),
+            "read": parts.read,
+            "project": parts.project,
+            "scatter": parts.scatter,
+            "merge": parts.merge,  # what scatter drew
+        }
+        times: dict[str, list[float]] = {part: [] for part in work}
+        for _ in range(repeats + 2):
+            for part, run in work.items():
+                start = time.perf_counter()
+                run()
+                times[part].append(time.perf_counter() - start)
+    return {part: seconds[2:] for part, seconds in times.items()}  # the first ones compile and take memory
 
 
 @dataclass
@@ -160,9 +166,14 @@ class _Parts:
         self._framebuffers = np.full((self.threads, height * self._pitch + 1), FRAMEBUFFER_EMPTY)
         self._framebuffers[:, -1] = 0
         self._dirty = np.zeros((self.threads, height * self._pitch // kernels.RUN + 1), np.uint8)
+        self._frame = np.empty((height, width), np.uint64)
+        self._filled = np.ones(height * self._pitch // kernels.RUN, np.uint8)
 
-    def project_times(self, repeats: int) -> list[float]:
-        return self._times(lambda: self._project(False), repeats)
+    def read(self) -> None:
+        self._run(lambda i: read_share(self.columns_read, i, self.threads))
+
+    def project(self) -> None:
+        self._project(False)
 
     def _project(self, keep: bool) -> None:
         self._run(
@@ -178,41 +189,16 @@ class _Parts:
             )
         )
 
-    def scatter_times(self, repeats: int) -> list[float]:
-        return self._times(self._scatter, repeats)
-
-    def _scatter(self) -> None:
+    def scatter(self) -> None:
         self._run(
             lambda i: _scatter_range(
                 self._place, self._words, self._cuts[i], self._cuts[i + 1], self._framebuffers[i], self._dirty[i]
             )
         )
 
-    def merge_times(self, repeats: int) -> list[float]:
-        height, width = self.camera.height, self.camera.width
-        frame, filled = np.empty((height, width), np.uint64), np.ones(height * self._pitch // kernels.RUN, np.uint8)
-        self._scatter()
-        drawn = self._dirty.copy()
-
-        def merge() -> None:
-            counter = np.zeros(1, np.int64)
-            self._run(lambda _: kernels.merge(self._framebuffers, self._dirty, frame, filled, counter))
-
-        times = []
-        for _ in range(repeats + 1):
-            self._dirty[:] = drawn
-            start = time.perf_counter()
-            merge()
-            times.append(time.perf_counter() - start)
-        return times[1:]
-
-    def _times(self, work: Callable[[], None], repeats: int) -> list[float]:
-        times = []
-        for _ in range(repeats + 1):  # the first one compiles
-            start = time.perf_counter()
-            work()
-            times.append(time.perf_counter() - start)
-        return times[1:]
+    def merge(self) -> None:
+        counter = np.zeros(1, np.int64)
+        self._run(lambda _: kernels.merge(self._framebuffers, self._dirty, self._frame, self._filled, counter))
 
     def _run(self, work: Callable[[int], None]) -> None:
         for _ in self.executor.map(work, range(self.threads)):
