@@ -25,6 +25,9 @@ from ..shared.store import Scene
 from ..shared.views import camera_views
 from .sink import FrameSink, layer_name
 
+SPLAT_COLOUR = "#d0d0d0"
+"""Colour of lit splats where points have none but the shading of their normals."""
+
 
 class Job:
     """What a run needs to know, checked: anything wrong with configuration or scene is raised here (InputError).
@@ -65,6 +68,8 @@ class Job:
         self.colouring = Colouring.choose(
             self.scene, render.colour, render.colormap, render.colour_range, render.class_colours
         )
+        if self.splats and self.splats.lighting and self.colouring.mode == "normal":  # light falls on a splat once
+            self.colouring = Colouring.choose(self.scene, SPLAT_COLOUR)
         self.views = camera_views(config.camera, info, self.n_pictures, render.supersampling)
         self.n_frames = self.n_pictures * self.views.per_picture
         largest_px = render.supersampling * max(config.camera.width, config.camera.height)
