@@ -14,6 +14,9 @@ module                  source
 ``ci``                  Mallón et al., "Algorithms and Hardware for Data Compression in Point Rendering", 3.1
 ``eci``                 the same, 3.2: layers of neighbours
 ``ci_reference`` …      the paper's two in plain form, bit by bit
+``occupancy``           octree occupancy, entropy coded (not in the papers)
+``mixing``              adaptive probabilities from several contexts, Mahoney 2005
+``range_coder``         yes or no at as many bits as its probability says
 ======================  ==================================================================================
 
 Data that comes from a file or a socket is never believed: decoders raise ``CodecError`` on anything that no encoder
