@@ -70,6 +70,11 @@ set = { image.codec = "jpeg" }
 method = "rasterizer"
 key = "render.rasterizer"
 values = ["cpu", "gl"]
+[[sweep]]
+method = "density"
+key = "sampling.points_per_pixel"
+values = [1, 3, 9]
+set = { sampling.pixel_threshold = 8 }
 """
 
 
@@ -111,10 +116,10 @@ def call(*arguments, monkeypatch):
 def test_a_sweep_end_to_end(config, no_gl, monkeypatch, capsys):
     assert call("error", config, "--json", config.with_name("e.json"), monkeypatch=monkeypatch) == 0
     out = config.parent / "out"
-    assert "12 points on 1 scenes" in capsys.readouterr().out
+    assert "15 points on 1 scenes" in capsys.readouterr().out
     result = json.loads(config.with_name("e.json").read_text())
     rows = {(row["method"], row["value"]): row for row in result["rows"]}
-    assert len(rows) == len(result["rows"]) == 12
+    assert len(rows) == len(result["rows"]) == 15
 
     exact = rows["layered", 0]
     assert exact["coverage_error"] < 1e-3, "float32 moves a square's border over a pixel centre now and then"
@@ -122,12 +127,14 @@ def test_a_sweep_end_to_end(config, no_gl, monkeypatch, capsys):
     assert exact["points"] > 30_000, "the whole city is in view"
     layered = [rows["layered", threshold] for threshold in (0, 4, 8, 16)]
     assert all(row["points"] < exact["points"] / 2 for row in layered[1:])
-    for finer, coarser in pairwise(layered):
-        assert finer["flip"] <= coarser["flip"]
-        assert finer["coverage_error"] <= coarser["coverage_error"]
+    assert all(row["flip"] > exact["flip"] and row["coverage_error"] > exact["coverage_error"] for row in layered[1:])
+    for sparse, dense in pairwise([rows["density", density] for density in (1, 3, 9)] + [exact]):
+        assert sparse["points"] < dense["points"]
+        assert sparse["flip"] > dense["flip"]
+        assert sparse["coverage_error"] >= dense["coverage_error"]
     for finer, coarser in pairwise(layered[1:]):
         assert finer["message_bytes"] > coarser["message_bytes"], "a coarser cut has fewer entries"
-    assert layered[-1]["holes"] > 0.01
+    assert rows["density", 1]["holes"] > 0.01
     assert layered[-1]["message_bytes"] > exact["message_bytes"], (
         "a cut has more entries than whole leaves, which merge"
     )
