@@ -34,9 +34,10 @@ CORNER_TOLERANCE = 0.34
 """Between the corner of a cube, whose λ2 − λ0 is a quarter, and a right-angled edge, where it is at least 0.43."""
 EDGE_TOLERANCE = 0.28
 """Enough for a right-angled edge; more would take in planes that are one and a half times as long as wide."""
-FLAT_DEVIATION = 0.5
-"""Half of what the default depth offset lets splats lie behind the quad and still be drawn."""
-QUAD_REACH = 2.0
+FLAT_DEVIATION = 1.0
+"""What the default depth offset lets splats lie behind the quad and still be drawn."""
+QUAD_REACH = 3.0
+"""Beyond its splats a quad hides what is behind; where it hides every splat of a pixel, rasterizers leave it out."""
 QUAD_MARGIN = 0.75
 """A quad reaches this many mean splat radii beyond the outermost points, so that it overlaps the quads beside it."""
 MIN_POINTS = 4
