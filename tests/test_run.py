@@ -187,8 +187,10 @@ def test_a_run_killed_at_any_moment_leaves_nothing_that_looks_whole_and_the_next
 
 def test_a_failure_while_running_is_one_line_and_debug_shows_where(config, tmp_path):
     out = tmp_path / "out"
+    single = {"pipeline.topology": "single"}
+    assert call(*command(config, out, **single)).returncode == 0, "compiles what is not in the cache yet"
     limited = ["sh", "-c", 'ulimit -f 4; exec "$@"', "-"]  # files above 2 KiB (or 4) cannot be written: a full disk
-    done = call(*limited, *command(config, out, **{"pipeline.topology": "single"}))
+    done = call(*limited, *command(config, out, **single))
     assert done.returncode == 2
     assert re.fullmatch(r"splatpipe: .*/out/frame_\d{4}.png: disk full\n", done.stderr), done.stderr
     assert_nothing_looks_whole(out)
