@@ -2,23 +2,32 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
+from rich.console import Console
+from splatpipe.cluster.bench.splats import bench_splats, print_splats
+from splatpipe.cluster.job import Job
 from splatpipe.nodes.raster import CellFeatures, PointSize, ResidentPoints, SplatSettings
 from splatpipe.nodes.raster.choose import make_rasterizer
 from splatpipe.nodes.raster.splat import CpuSplatRasterizer
 from splatpipe.nodes.raster.splat_geometry import LIGHT, EyeFrame, drawn_cells
 from splatpipe.nodes.raster.splat_reference import splat_frame
 from splatpipe.nodes.raster.splat_tiles import WEIGHT
+from splatpipe.shared.build import BuildSettings, build_scene
 from splatpipe.shared.camera import Camera, look_at, perspective_camera
+from splatpipe.shared.config import RunConfig
 from splatpipe.shared.errors import ConfigError, InputError, MessageError
 from splatpipe.shared.messages import FRAMEBUFFER_EMPTY, RENDER_POINT
 from splatpipe.shared.octree import CORNER, FLAT
 from splatpipe.shared.points import NO_NORMAL, pack_normals, pack_radii, pack_rgb
+
+from .build_sources import ArraySource
 
 EDGE = 4.0
 
@@ -304,3 +313,30 @@ def test_points_without_normals_face_the_eye():
     view = camera(100, 80)
     fast, slow = (f(points, view, all_of(points), SplatSettings()) for f in (draw, splat_frame))
     expect_same_picture(fast, slow)
+
+
+def test_bench_counts_what_the_visibility_pass_saves(tmp_path):
+    rng = np.random.default_rng(3)
+    positions = np.column_stack([rng.uniform(-1, 1, (4000, 2)), np.zeros(4000)])
+    settings_ = BuildSettings(features=True, points_per_cell=40)
+    build_scene([ArraySource(positions)], tmp_path / "plane.scene", settings=settings_)
+    results = bench_splats([tmp_path / "plane.scene"], size=96, views=2, repeats=1, pictures=tmp_path / "pictures")
+    row = results["rows"][0]
+    assert row["points"] == 4000
+    assert row["reduction"] > 0.7
+    assert row["psnr_db"] > 25
+    assert row["holes_px"]["splats"] < 0.05 * row["holes_px"]["points"]
+    with Image.open(tmp_path / "pictures" / "plane.png") as picture:
+        assert picture.size == (4 * 96, 96)
+    console = Console(record=True, width=200, file=io.StringIO())
+    print_splats(results, console)
+    assert f"{row['reduction']:.2%}" in console.export_text()
+
+
+def test_lit_splats_are_not_shaded_twice(tmp_path):
+    positions = np.random.default_rng(3).normal(size=(300, 3))
+    build_scene([ArraySource(positions)], tmp_path / "s.scene", settings=BuildSettings(splats=True))
+    for lighting, mode in ((True, "constant"), (False, "normal")):
+        config = {"scene": {"path": str(tmp_path / "s.scene")}, "splats": {"lighting": lighting}}
+        job = Job(RunConfig.model_validate(config | {"render": {"style": "splats"}}))
+        assert job.colouring.mode == mode

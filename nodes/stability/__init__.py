@@ -10,6 +10,7 @@ module          owns
 ``clouds``      degenerate clouds: coincident, collinear, one hot octant, …
 ``compact``     positions in fixed point
 ``viewports``   pixel borders and the smallest and largest images
+``splats``      degenerate and grazing splats, any ε, the smallest and largest images
 ``large``       more points than 32 bits count
 ==============  ===============================================================
 """
