@@ -14,6 +14,10 @@ module                  source
 ``ci``                  Mallón et al., "Algorithms and Hardware for Data Compression in Point Rendering", 3.1
 ``eci``                 the same, 3.2: layers of neighbours
 ``ci_reference`` …      the paper's two in plain form, bit by bit
+``streams``             Kim, Lee, Varshney, "Vertex Transformation Streams": bytes, and the gate that leaves them out
+``pools``               the same, 3 and 4: vertices, translations and tags
+``autocorrelation``     the same, 5: the most common translations
+``pools_reference``     tables and pools in plain form
 ``occupancy``           octree occupancy, entropy coded (not in the papers)
 ``mixing``              adaptive probabilities from several contexts, Mahoney 2005
 ``range_coder``         yes or no at as many bits as its probability says

@@ -1,0 +1,86 @@
+"""The most common translations between the points of a set, counted exactly: 3-D autocorrelation by real FFT.
+
+The number of points that a translation takes to another point is the autocorrelation of the set's occupancy grid. A
+transform of N_a values along axis a gives circular counts: those of translations a multiple of N_a apart, summed. The
+grid is padded only to the translations that are looked for: with N_a ≥ extent_a + reach_a no other translation that
+the set can have coincides with one of at most reach_a along every axis. Most common ones of a scanned surface are
+short, so a short reach does, and the circular counts prove it: beyond the reach they are upper bounds. Where the
+bounds leave room for a more common translation, the reach is doubled.
+
+Counts are exact: they are integers, and float64 puts them within 1e-9 of one (``shared/stability`` measures it; the
+bound of the transform's error is about log2(N)·2⁻⁵³ times the number of points), far from the 0.5 at which rounding
+would take another. float32 would halve the time, and comes too near to 0.5 for a full grid.
+
+Source: Kim, Lee, Varshney, "Vertex Transformation Streams", section 5, equations 1 to 3.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy import fft
+
+_fft: Any = fft  # its functions have no types of their own: they are dispatched
+
+PALETTE_SIZE = 256
+"""Most translations of a palette: the paper's."""
+
+LEAST_SHARE = 1 / 32
+"""Of the points, that a translation must take to another one: below, it could not fill its row of a pool."""
+
+MAX_REACH = 127
+"""Longest translation along an axis: a signed byte."""
+
+_FIRST_REACH = 12
+
+
+def common_translations(points: np.ndarray, size: int = PALETTE_SIZE) -> tuple[np.ndarray, np.ndarray]:
+    """The most common translations between (n, 3) distinct grid points, and how many points each takes to another.
+
+    Returns (m, 3) int64, each axis in −127 … 127, and (m,) int64 counts; m ≤ size, counts ≥ n · ``LEAST_SHARE``. The
+    first is no translation at all, of count n; t and −t are two. Most common first, of equal ones the one that is
+    shorter along its longest axis, then by x, y, z.
+    Cost: O(N log N) time and 40 bytes for each of the N values of the padded grid; n > 0.
+    """
+    lower = points.min(axis=0).astype(np.int64)
+    extent = points.max(axis=0) - lower + 1
+    least = max(1, int(np.ceil(len(points) * LEAST_SHARE)))
+    longest = np.minimum(extent - 1, MAX_REACH)
+    reach = np.minimum(longest, _FIRST_REACH)
+    while True:
+        counts = np.rint(circular_counts(points - lower, padded_shape(extent, reach))).astype(np.int64)
+        window = np.ix_(*(np.arange(-r, r + 1) for r in reach))
+        inside = counts[window]
+        counts[window] = 0
+        translations, found = _most_common(inside, reach, least, size)
+        if (reach == longest).all() or counts.max() < (found[-1] + 1 if len(found) == size else least):
+            return translations, found
+        reach = np.minimum(longest, 2 * reach)
+
+
+def padded_shape(extent: np.ndarray, reach: np.ndarray) -> tuple[int, ...]:
+    """Values along each axis so that circular counts are those of translations up to ``reach``; lengths that are
+    fast to transform.
+    """
+    return tuple(_fft.next_fast_len(int(e + r), real=True) for e, r in zip(extent, reach, strict=True))
+
+
+def circular_counts(points: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Float64 array of this shape: at t, how many of (n, 3) points are points when t is added, modulo the shape."""
+    grid = np.zeros(shape)
+    grid[tuple(points.T)] = 1
+    spectrum = _fft.rfftn(grid)
+    power = spectrum.real**2 + spectrum.imag**2
+    return _fft.irfftn(power, s=shape, overwrite_x=True)
+
+
+def _most_common(counts: np.ndarray, reach: np.ndarray, least: int, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """The ``size`` largest of the counts that are at least ``least``; counts start at −reach along each axis."""
+    flat = counts.ravel()
+    if len(flat) > size:
+        least = max(least, int(np.partition(flat, -size)[-size]))
+    chosen = np.flatnonzero(flat >= least)
+    x, y, z = translations = np.array(np.unravel_index(chosen, counts.shape)) - reach[:, None]
+    order = np.lexsort([z, y, x, np.abs(translations).max(axis=0), -flat[chosen]])[:size]
+    return translations.T[order], flat[chosen][order]
