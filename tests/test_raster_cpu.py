@@ -77,6 +77,16 @@ def test_any_entries_equal_the_twin(entries, size, threads):
     np.testing.assert_array_equal(draw(points, view, entries, size, threads), expected)
 
 
+@pytest.mark.parametrize("side", [4, 5, 6, 63, 64, 65, 150])
+def test_squares_over_several_runs_are_merged_whole(side):
+    """Two frames, so that a run that one of them drew to and did not mark would be seen."""
+    points, view = cloud(300), camera(400, 90)
+    with CpuRasterizer(points, 400, 90, PointSize(side), threads=2) as rasterizer:
+        for entries in (render_points((0, 300, 1)), render_points((3, 200, 50))):
+            expected = reference_frame(points, view, entries, PointSize(side), project_float32)
+            np.testing.assert_array_equal(rasterizer.draw(view, entries), expected)
+
+
 def test_a_point_is_rounded_alike_wherever_it_stands():
     """Vector body and remainder: each point alone gives the words that all of them give together."""
     points, view = cloud(301, blocks=1), camera(64, 64)

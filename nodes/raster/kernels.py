@@ -35,10 +35,11 @@ PREFETCHED = 512
 """Points of the next piece that are asked for while one is drawn: pieces are short and far apart where a scene is drawn
 from many cells, and the hardware's own prefetching needs some lines and stops at a page."""
 
-RUN = 64
+_RUN_BITS = 6
+RUN = 1 << _RUN_BITS
 """Framebuffer words that are drawn to, or not, as one: 512 bytes of a row."""
 
-RUN_SHIFT = np.uintp(6)
+RUN_SHIFT = np.uintp(_RUN_BITS)
 _EMPTY = np.uint64(FRAMEBUFFER_EMPTY)
 _FLOAT_MAX = np.float32(np.finfo(np.float32).max)
 _ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
@@ -293,12 +294,54 @@ def _take_pixels(place, packed, n, words, dirty):
 def _take_squares(place, packed, n, view, words, dirty):
     width, height, pitch = np.int64(view.width), np.int64(view.height), np.int64(view.pitch)
     for i in range(n):
-        word, side = packed[i], place[2 * BATCH + i]
-        begin, end = max(place[i], 0), min(place[i] + side, width)
-        for row in range(max(place[BATCH + i], 0), min(place[BATCH + i] + side, height)):
-            for p in range(row * pitch + begin, row * pitch + end):
-                words[p] = min(words[p], word)
-                dirty[np.uintp(p) >> RUN_SHIFT] = 1
+        word, side = packed[i], np.int64(place[2 * BATCH + i])
+        left, top = np.int64(place[i]), np.int64(place[BATCH + i])
+        whole = (left >= 0) & (top >= 0) & (left + side <= width) & (top + side <= height)
+        first = top * pitch + left
+        # loops of a known length are unrolled: two thirds of the time of the general one
+        if whole & (side == 2):
+            _take_square(first, 2, pitch, word, words, dirty)
+        elif whole & (side == 3):
+            _take_square(first, 3, pitch, word, words, dirty)
+        elif whole & (side == 1):
+            _take_square(first, 1, pitch, word, words, dirty)
+        elif whole & (side == 4):
+            _take_square(first, 4, pitch, word, words, dirty)
+        elif whole & (side == 5):
+            _take_square(first, 5, pitch, word, words, dirty)
+        else:
+            rows, columns = (max(top, 0), min(top + side, height)), (max(left, 0), min(left + side, width))
+            _take_rectangle(rows, columns, pitch, word, words)
+            _mark_rectangle(rows, columns, pitch, dirty)
+
+
+@njit(nogil=True, cache=True)
+def _take_rectangle(rows, columns, pitch, word, words):
+    for row in range(rows[0], rows[1]):
+        for column in range(columns[0], columns[1]):
+            p = np.uintp(row * pitch + column)
+            words[p] = min(words[p], word)
+
+
+@njit(nogil=True, cache=True)
+def _mark_rectangle(rows, columns, pitch, dirty):
+    first, last = columns[0] >> _RUN_BITS, (columns[1] - 1) >> _RUN_BITS
+    for row in range(rows[0], rows[1]):
+        run = row * (pitch >> _RUN_BITS)
+        dirty[np.uintp(run + first)] = 1
+        for column in range(first + 1, last + 1):
+            dirty[np.uintp(run + column)] = 1
+
+
+@njit(nogil=True, cache=True)
+def _take_square(first, side, pitch, word, words, dirty):
+    """A whole square, at most ``RUN`` words wide."""
+    for row in range(side):
+        for column in range(side):
+            p = np.uintp(first + row * pitch + column)
+            words[p] = min(words[p], word)
+        dirty[np.uintp(first + row * pitch) >> RUN_SHIFT] = 1
+        dirty[np.uintp(first + row * pitch + side - 1) >> RUN_SHIFT] = 1
 
 
 @njit(nogil=True, cache=True)
