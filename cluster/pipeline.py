@@ -34,7 +34,7 @@ def run_single(job: Job, progress: Progress) -> dict[str, Any]:
     """All three nodes in this process, frame after frame; the statistics of the run. Imports no MPI."""
     clocks = [StageClock(role) for role in ROLES]
     counts = FrameCounts()
-    octree = job.scene.octree()
+    octree = job.scene.octree(features=job.wanted.features)
     culling, sampling = job.culling_node(octree), job.sampling_node(octree)
     sampling.process(job.camera(0), culling.process(job.camera(0)))  # compiles, or loads what was compiled
     with job.open_render(progress) as render:
@@ -130,7 +130,7 @@ def _coordinate(job: Job, transport: Transport, progress: Progress) -> dict[str,
 
 def _sample(job: Job, transport: Transport) -> None:
     clock = StageClock("sampling")
-    octree = job.scene.octree()
+    octree = job.scene.octree(features=job.wanted.features)
     sampling = job.sampling_node(octree)
     sampling.process(job.camera(0), job.culling_node(octree).process(job.camera(0)))
     transport.meet()

@@ -19,13 +19,16 @@ from splatpipe.nodes.raster.splat import CpuSplatRasterizer
 from splatpipe.nodes.raster.splat_geometry import LIGHT, EyeFrame, drawn_cells
 from splatpipe.nodes.raster.splat_reference import splat_frame
 from splatpipe.nodes.raster.splat_tiles import WEIGHT
+from splatpipe.nodes.sampling import SamplingNode
 from splatpipe.shared.build import BuildSettings, build_scene
 from splatpipe.shared.camera import Camera, look_at, perspective_camera
 from splatpipe.shared.config import RunConfig
 from splatpipe.shared.errors import ConfigError, InputError, MessageError
-from splatpipe.shared.messages import FRAMEBUFFER_EMPTY, RENDER_POINT
+from splatpipe.shared.messages import FRAMEBUFFER_EMPTY, RENDER_POINT, VisibilityBits
 from splatpipe.shared.octree import CORNER, FLAT
+from splatpipe.shared.octree import EDGE as EDGE_CELL
 from splatpipe.shared.points import NO_NORMAL, pack_normals, pack_radii, pack_rgb
+from splatpipe.shared.store import Scene
 
 from .build_sources import ArraySource
 
@@ -340,3 +343,28 @@ def test_lit_splats_are_not_shaded_twice(tmp_path):
         config = {"scene": {"path": str(tmp_path / "s.scene")}, "splats": {"lighting": lighting}}
         job = Job(RunConfig.model_validate(config | {"render": {"style": "splats"}}))
         assert job.colouring.mode == mode
+
+
+def test_edges_and_corners_are_sampled_more_densely(tmp_path):
+    rng = np.random.default_rng(4)
+    cube = rng.uniform(0, 1, (20_000, 3))
+    cube[np.arange(len(cube)), rng.integers(0, 3, len(cube))] = rng.integers(0, 2, len(cube))
+    build_scene([ArraySource(cube)], tmp_path / "c.scene", settings=BuildSettings(features=True, points_per_cell=400))
+    scene = Scene.open(tmp_path / "c.scene")
+    view = camera(60, 60, (2.0, -3.0, 2.5))
+    tree = scene.octree(features=True)
+    order = np.argsort(tree.first_point)
+    of_cell = []
+    for octree in (scene.octree(), tree):
+        bits = VisibilityBits.pack(0, np.ones(len(octree), bool))
+        chosen = SamplingNode(octree, pixel_threshold=16, points_per_pixel=1).process(view, bits)
+        drawn = np.zeros(scene.info.n_stored, np.int64)
+        for first, n, _ in chosen.entries.tolist():
+            drawn[first : first + n] = 1
+        of_cell.append(np.add.reduceat(drawn, tree.first_point[order]))
+    sharp = np.isin(tree.feature, (EDGE_CELL, CORNER))[order]
+    less, more = of_cell
+    both = (less > 0) & (more > 0)
+    np.testing.assert_array_equal(more[both & ~sharp], less[both & ~sharp])
+    assert more[both & sharp].sum() > 1.5 * less[both & sharp].sum() > 0
+    assert more.sum() > less.sum()

@@ -83,6 +83,7 @@ class SceneRecipe(Section):
     points_per_cell: int = 4096
     max_depth: int = 21
     flatness: float = 0.0
+    features: bool = False
     up: str = "auto"
 
 

@@ -51,6 +51,7 @@ def _make(name: str, recipe: SceneRecipe, path: Path, file: Path) -> None:
         points_per_cell=recipe.points_per_cell,
         max_depth=recipe.max_depth,
         flatness=recipe.flatness,
+        features=recipe.features,
         up="z" if recipe.synth else recipe.up,
         overwrite=True,
     )
