@@ -14,12 +14,11 @@ from splatpipe.nodes.raster.blocks import (
     HIGH_BITS_ERROR_PX,
     OUTSIDE,
     Blocks,
-    block_rows,
     frustum,
 )
 from splatpipe.nodes.raster.compact import CompactPositions, compact_positions
 from splatpipe.nodes.raster.cpu import CpuRasterizer
-from splatpipe.nodes.raster.kernels import FILTERED
+from splatpipe.nodes.raster.kernels import FILTERED, block_rows
 from splatpipe.nodes.raster.reference import (
     compact_rows,
     fixed_point_bins,

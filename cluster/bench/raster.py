@@ -257,6 +257,6 @@ def read_share(columns: Sequence[np.ndarray], thread: int, threads: int) -> None
 def _read(column, begin, end):
     """Something that depends on every bit of a (n,) uint32 column, at a cost that memory hides."""
     mixed = np.uint32(0)
-    for i in range(begin, end):
-        mixed ^= column[i]
+    for i in range(end - begin):
+        mixed ^= column[np.uintp(begin) + np.uintp(i)]  # without the sign the compiler vectorises it
     return mixed

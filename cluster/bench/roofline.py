@@ -24,7 +24,7 @@ import numpy as np
 from numba import njit
 
 from ...nodes.raster import ResidentPoints, kernels
-from ...nodes.raster.blocks import FLOAT32, FULL, HIGH, Blocks, block_rows, frustum
+from ...nodes.raster.blocks import FLOAT32, FULL, HIGH, Blocks, frustum
 from ...nodes.raster.compact import compact_positions
 from ...nodes.raster.cpu import CpuRasterizer
 from ...shared.camera import Camera
@@ -145,7 +145,7 @@ class _Parts:
         n_blocks = len(points.block_origin)
         blocks, seen = Blocks(points.block_origin, np.zeros(n_blocks), lower, step), frustum(self.camera, 1.5)
         self._rows = np.empty((n_blocks, 3, 4), np.float32)
-        precision = np.array([block_rows(blocks, s, seen, self._rows[s]) for s in range(n_blocks)], np.uint8)
+        precision = np.array([kernels.block_rows(blocks, s, seen, self._rows[s]) for s in range(n_blocks)], np.uint8)
         self._precision = precision
         self._first = np.append(points.block_first_point, n).astype(np.int64)
         n_of_block = np.diff(self._first)
@@ -205,7 +205,7 @@ class _Parts:
             pass
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)  # numba's cache would not see that the kernels have changed
 def _project_range(columns, blocks, cut, view, outside, place, words, keep):
     """Words of the points ``cut[0]`` … ``cut[1]`` − 1: kept, or made again and again from one batch in the cache."""
     x, y, z, high, low, colour = columns

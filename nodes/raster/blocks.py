@@ -1,15 +1,10 @@
-"""Compiled: what a frame needs of a block, worked out by the thread that draws it, in float64 and rounded once.
-
-It costs about 0.1 µs a piece, so no pass over the blocks stands before a frame and nothing is kept between frames.
-``pixel_from_blocks`` and ``reference.compact_rows`` are the readable twins: the same steps in the same order.
-"""
+"""Blocks of the point-array and the frustum that they are held against, as the compiled kernels take them."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from ...shared.camera import Camera
 
@@ -22,9 +17,6 @@ FLOAT32, HIGH, FULL, OUTSIDE = 0, 1, 2, 3
 HIGH_BITS_ERROR_PX = 1 / 8
 """A point moves by less than this along each image axis where its low bits are not read: a quarter of what drawing it
 as a whole pixel moves it by. That is the bound; on a surface the mean is a quarter of it (``RESULTS.md``)."""
-
-_ROUNDING = 2.0**-20
-"""Relative to the sum of the terms' sizes, more than what float32 rounds in a row of a matrix times a position."""
 
 
 class Blocks(NamedTuple):
@@ -46,6 +38,7 @@ class Frustum(NamedTuple):
     eye : (3,) world frame.  rows : (3, 3): X, Y and W over positions relative to the eye.  near, focal_px : as of the
     camera.
     planes : (5, 3) over positions relative to the eye: depth, and four that are ≥ 0 within the image and its margin.
+    high_bits_error_px : ``HIGH_BITS_ERROR_PX``.
     px_at_one : (2, 3), at most so many pixels a point at depth 1 in the image moves for each world unit it is moved.
     """
 
@@ -54,6 +47,7 @@ class Frustum(NamedTuple):
     near: float
     focal_px: float
     planes: np.ndarray
+    high_bits_error_px: float
     px_at_one: np.ndarray
 
 
@@ -67,61 +61,4 @@ def frustum(camera: Camera, margin_px: float) -> Frustum:
     # u − width / 2 = X' / w, so that |du| = |dX' − (u − width / 2) dw| / w
     px_at_one = np.abs([x - half_width * w, y - half_height * w]) + np.outer([half_width, half_height], np.abs(w))
     eye = np.array(camera.eye, np.float64)
-    return Frustum(eye, rows, float(camera.near), float(camera.focal_px), planes, px_at_one)
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def block_rows(blocks, s, frustum, out):
-    """Fill ``out`` (3, 4) float32: rows X, Y, W over the positions of block ``s``; return how those are read.
-
-    The eye is subtracted first, so a scene far from the world's origin loses nothing.
-    """
-    m = frustum.rows
-    x, y, z = (
-        blocks.origin[s, 0] - frustum.eye[0],
-        blocks.origin[s, 1] - frustum.eye[1],
-        blocks.origin[s, 2] - frustum.eye[2],
-    )
-    if len(blocks.step) == 0:
-        for i in range(3):
-            out[i, 0], out[i, 1], out[i, 2] = m[i, 0], m[i, 1], m[i, 2]
-            out[i, 3] = x * m[i, 0] + y * m[i, 1] + z * m[i, 2]
-        return FLOAT32
-
-    x, y, z = x + blocks.lower[s, 0], y + blocks.lower[s, 1], z + blocks.lower[s, 2]
-    a, b, c = blocks.step[s, 0], blocks.step[s, 1], blocks.step[s, 2]
-    nearest, precision = _nearest(x, y, z, a, b, c, frustum), HIGH
-    if nearest < 0:
-        return OUTSIDE
-    for i in range(2):
-        p = frustum.px_at_one[i]
-        if not 2.0 ** (BITS // 2 - 1) * (p[0] * a + p[1] * b + p[2] * c) <= HIGH_BITS_ERROR_PX * nearest:
-            precision = FULL
-    if precision == HIGH:
-        a, b, c = a * 2.0 ** (BITS // 2), b * 2.0 ** (BITS // 2), c * 2.0 ** (BITS // 2)
-    x, y, z = x + 0.5 * a, y + 0.5 * b, z + 0.5 * c
-    for i in range(3):
-        out[i, 0], out[i, 1], out[i, 2] = m[i, 0] * a, m[i, 1] * b, m[i, 2] * c
-        out[i, 3] = x * m[i, 0] + y * m[i, 1] + z * m[i, 2]
-    return precision
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def _nearest(x, y, z, a, b, c, frustum):
-    """Depth of the nearest point that a box can have in the image; −1 if it can have none there, rounding considered.
-
-    x, y, z : lower corner relative to the eye.  a, b, c : size of a bin.
-    """
-    a, b, c = a * 2.0 ** (BITS - 1), b * 2.0 ** (BITS - 1), c * 2.0 ** (BITS - 1)
-    x, y, z = x + a, y + b, z + c  # middle of the box, and half its size
-    nearest = 0.0
-    for i in range(5):
-        p = frustum.planes[i]
-        middle = p[0] * x + p[1] * y + p[2] * z
-        reach = abs(p[0]) * a + abs(p[1]) * b + abs(p[2]) * c
-        slack = _ROUNDING * (abs(p[0] * x) + abs(p[1] * y) + abs(p[2] * z) + reach)
-        if middle + reach + slack < (frustum.near if i == 0 else 0.0):
-            return -1.0
-        if i == 0:
-            nearest = max(middle - reach - slack, frustum.near)
-    return nearest
+    return Frustum(eye, rows, float(camera.near), float(camera.focal_px), planes, HIGH_BITS_ERROR_PX, px_at_one)

@@ -26,7 +26,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from ...shared.messages import FRAMEBUFFER_EMPTY
-from .blocks import FLOAT32, FULL, HIGH, OUTSIDE, block_rows
+from .blocks import BITS, FLOAT32, FULL, HIGH, OUTSIDE
 
 BATCH = 1024
 """Points drawn at a time: their 28 KiB of scratch fit the first-level cache; long loops keep more misses under way."""
@@ -42,6 +42,7 @@ RUN = 1 << _RUN_BITS
 RUN_SHIFT = np.uintp(_RUN_BITS)
 _EMPTY = np.uint64(FRAMEBUFFER_EMPTY)
 _FLOAT_MAX = np.float32(np.finfo(np.float32).max)
+_ROUNDING = 2.0**-20  # of the sum of the terms' sizes: more than what float32 rounds in a row times a position
 _ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
 _TEN_BITS = np.uint32(1023)
 _NAN = np.float32(np.nan)
@@ -175,6 +176,65 @@ def draw(points, blocks, pieces, frustum, view, words, dirty, turn, counter):
                 else:
                     _take_squares(place, packed, n, view, words, dirty)
         begin = _fetch_add(counter, turn)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def block_rows(blocks, s, frustum, out):
+    """Fill ``out`` (3, 4) float32: rows X, Y, W over the positions of block ``s``; return how those are read.
+
+    The eye is subtracted first, so a scene far from the world's origin loses nothing. It costs about 0.1 µs, so each
+    thread does it for the pieces it draws, and no pass over the blocks stands before a frame.
+    Readable twins, the same steps in the same order: ``pixel_from_blocks`` and ``reference.compact_rows``.
+    """
+    m = frustum.rows
+    x, y, z = (
+        blocks.origin[s, 0] - frustum.eye[0],
+        blocks.origin[s, 1] - frustum.eye[1],
+        blocks.origin[s, 2] - frustum.eye[2],
+    )
+    if len(blocks.step) == 0:
+        for i in range(3):
+            out[i, 0], out[i, 1], out[i, 2] = m[i, 0], m[i, 1], m[i, 2]
+            out[i, 3] = x * m[i, 0] + y * m[i, 1] + z * m[i, 2]
+        return FLOAT32
+
+    x, y, z = x + blocks.lower[s, 0], y + blocks.lower[s, 1], z + blocks.lower[s, 2]
+    a, b, c = blocks.step[s, 0], blocks.step[s, 1], blocks.step[s, 2]
+    nearest, precision = _nearest(x, y, z, a, b, c, frustum), HIGH
+    if nearest < 0:
+        return OUTSIDE
+    for i in range(2):
+        p = frustum.px_at_one[i]
+        if not 2.0 ** (BITS // 2 - 1) * (p[0] * a + p[1] * b + p[2] * c) <= frustum.high_bits_error_px * nearest:
+            precision = FULL
+    if precision == HIGH:
+        a, b, c = a * 2.0 ** (BITS // 2), b * 2.0 ** (BITS // 2), c * 2.0 ** (BITS // 2)
+    x, y, z = x + 0.5 * a, y + 0.5 * b, z + 0.5 * c
+    for i in range(3):
+        out[i, 0], out[i, 1], out[i, 2] = m[i, 0] * a, m[i, 1] * b, m[i, 2] * c
+        out[i, 3] = x * m[i, 0] + y * m[i, 1] + z * m[i, 2]
+    return precision
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _nearest(x, y, z, a, b, c, frustum):
+    """Depth of the nearest point that a box can have in the image; −1 if it can have none there, rounding considered.
+
+    x, y, z : lower corner relative to the eye.  a, b, c : size of a bin.
+    """
+    a, b, c = a * 2.0 ** (BITS - 1), b * 2.0 ** (BITS - 1), c * 2.0 ** (BITS - 1)
+    x, y, z = x + a, y + b, z + c  # middle of the box, and half its size
+    nearest = 0.0
+    for i in range(5):
+        p = frustum.planes[i]
+        middle = p[0] * x + p[1] * y + p[2] * z
+        reach = abs(p[0]) * a + abs(p[1]) * b + abs(p[2]) * c
+        slack = _ROUNDING * (abs(p[0] * x) + abs(p[1] * y) + abs(p[2] * z) + reach)
+        if middle + reach + slack < (frustum.near if i == 0 else 0.0):
+            return -1.0
+        if i == 0:
+            nearest = max(middle - reach - slack, frustum.near)
+    return nearest
 
 
 @njit(nogil=True, cache=True)
