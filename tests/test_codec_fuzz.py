@@ -1,11 +1,12 @@
-"""Damaged streams: each gives points, no more than allowed and inside the grid, or one CodecError. 120 000 inputs."""
+"""Damaged streams: each gives points, no more than allowed and inside the grid, or one CodecError. 160 000 inputs."""
 
 import numpy as np
 import pytest
 from splatpipe.shared.codecs import Codec, ci, eci, occupancy
+from splatpipe.shared.codecs.linear_groups import LinearGroupCodec
 from splatpipe.shared.errors import CodecError
 
-CODECS: list[Codec] = [ci, eci, occupancy]
+CODECS: list[Codec] = [ci, eci, occupancy, LinearGroupCodec(1.5)]
 N_INPUTS = 40_000
 MOST_POINTS = 300
 

@@ -21,6 +21,8 @@ module                  source
 ``occupancy``           octree occupancy, entropy coded (not in the papers)
 ``mixing``              adaptive probabilities from several contexts, Mahoney 2005
 ``range_coder``         yes or no at as many bits as its probability says
+``linear_groups``       Dinerstein, Egbert, Flann, "Linear Grouping": bytes, and maps of end points. Lossy
+``group_search`` …      the same, 3: which points define lines for which; and in plain form
 ======================  ==================================================================================
 
 Data that comes from a file or a socket is never believed: decoders raise ``CodecError`` on anything that no encoder
