@@ -62,6 +62,21 @@ def test_reference_and_compiled_give_the_same_bytes(case):
     assert data[1:].tobytes() == encode_stream(points, bits)
 
 
+def test_repeats_cost_about_what_their_number_tells():
+    """Half of the points twice: one bit a distinct point, and a point that stands there 1000 times a few bytes."""
+    points = sphere(6)
+    twice = np.concatenate([points, points[np.random.default_rng(0).random(len(points)) < 0.5]])
+    n_bytes = [len(occupancy.encode(p, 6).data) for p in (points, twice, np.repeat(points[:1], 1000, axis=0))]
+    assert 8 * (n_bytes[1] - n_bytes[0]) == pytest.approx(len(points), rel=0.05)
+    assert n_bytes[2] < 20
+
+
+def test_more_repeats_than_the_caller_allows():
+    data = occupancy.encode(np.zeros((50, 3), np.int64), 3).data
+    with pytest.raises(CodecError, match="more than 49 points"):
+        occupancy.decode(data, 3, 49)
+
+
 def sphere(bits):
     """Distinct grid points of a sphere, sampled far more densely than the grid is fine."""
     direction = np.random.default_rng(2).normal(size=(40 << 2 * bits, 3))
@@ -89,5 +104,6 @@ def test_data_that_ends_early_or_late_is_one_clear_error():
             occupancy.decode(damaged, 4, n)
     with pytest.raises(CodecError, match="expected at most"):
         occupancy.decode(data, 4, n - 1)
-    with pytest.raises(CodecError, match="behind no points"):
-        occupancy.decode(np.array([0, 0], np.uint8), 4, n)
+    for nothing in ([0, 0], [1]):
+        with pytest.raises(CodecError, match="behind no points"):
+            occupancy.decode(np.array(nothing, np.uint8), 4, n)

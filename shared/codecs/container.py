@@ -42,10 +42,24 @@ class Head:
         return points if self.counts is None else np.repeat(points, self.counts, axis=0)
 
 
+def write_number(counts: np.ndarray) -> np.ndarray:
+    """(m,) uint8: the first varint for (n,) counts."""
+    return write_varints(np.array([2 * len(counts) + bool((counts > 1).any())]))
+
+
+def read_number(data: np.ndarray, most_points: int) -> tuple[int, bool, int]:
+    """(n, whether some repeat, index of the byte after them). Raises CodecError, also above ``most_points``."""
+    (number,), at = read_varints(data, 0, 1)
+    n = int(number) >> 1
+    if n > most_points:
+        raise CodecError(f"coded points: found {n} points, expected at most {most_points}")
+    return n, bool(number & 1), at
+
+
 def write_head(counts: np.ndarray) -> np.ndarray:
     """(m,) uint8 of (n,) counts ≥ 1 of the distinct points in coded order."""
     repeats = np.flatnonzero(counts > 1)
-    head = write_varints(np.array([2 * len(counts) + (len(repeats) > 0)]))
+    head = write_number(counts)
     if not len(repeats):
         return head
     more = counts[repeats] - 2
@@ -56,10 +70,7 @@ def write_head(counts: np.ndarray) -> np.ndarray:
 
 def read_head(data: np.ndarray, most_points: int) -> tuple[Head, int]:
     """Head of (m,) uint8 data, and the index of the byte after it. Raises CodecError, also above ``most_points``."""
-    (first,), at = read_varints(data, 0, 1)
-    n, repeats = int(first) >> 1, int(first) & 1
-    if n > most_points:
-        raise CodecError(f"coded points: found {n} points, expected at most {most_points}")
+    n, repeats, at = read_number(data, most_points)
     if not repeats:
         return Head(n, None), at
     (k,), at = read_varints(data, at, 1)

@@ -16,6 +16,9 @@ from numba import njit
 
 from .range_coder import PROBABILITY_BITS
 
+N_INPUTS = 3
+"""Contexts of an answer."""
+
 COUNTER_BITS = 22
 """Precision of a counter's probability; below it stand the bits of how often the context was seen."""
 _SEEN_BITS = 7
@@ -57,16 +60,16 @@ def new_counters(n_contexts: int) -> np.ndarray:
     return np.full(n_contexts, _NEW, np.int32)
 
 
-def new_weights(n_sets: int, n_inputs: int) -> np.ndarray:
-    """(n_sets, n_inputs) int32: each input about as good as another."""
-    return np.full((n_sets, n_inputs), (1 << _WEIGHT_BITS) * 6 // (5 * n_inputs), np.int32)
+def new_weights(n_sets: int) -> np.ndarray:
+    """(n_sets, N_INPUTS) int32: each input about as good as another."""
+    return np.full((n_sets, N_INPUTS), (1 << _WEIGHT_BITS) * 6 // (5 * N_INPUTS), np.int32)
 
 
 @njit(nogil=True, cache=True, inline="always")
 def predict(counters, contexts, weights, stretch, squash, logits):
-    """Probability of 1 in 1/65536, in (0, 65536). Keeps the (k,) ``logits`` of the contexts for ``learn``."""
+    """Probability of 1 in 1/65536, in (0, 65536). Keeps the (N_INPUTS,) ``logits`` of the contexts for ``learn``."""
     total = np.int64(0)
-    for k in range(len(contexts)):
+    for k in range(N_INPUTS):
         probability = counters[contexts[k]] >> _SEEN_BITS
         logits[k] = stretch[probability >> COUNTER_BITS - _STRETCHED_BITS]
         total += np.int64(weights[k]) * logits[k]
@@ -74,13 +77,24 @@ def predict(counters, contexts, weights, stretch, squash, logits):
 
 
 @njit(nogil=True, cache=True, inline="always")
+def predict_one(counter):
+    """Probability of 1 in 1/65536, in (0, 65536), of a single counter."""
+    probability = np.int64(counter) >> _SEEN_BITS + COUNTER_BITS - PROBABILITY_BITS
+    return min(max(probability, np.int64(1)), np.int64((1 << PROBABILITY_BITS) - 1))
+
+
+@njit(nogil=True, cache=True, inline="always")
+def learn_one(counter, rate, bit):
+    """The counter moved towards the answer."""
+    seen, value = np.int64(counter) & _MOST_SEEN, np.int64(counter) >> _SEEN_BITS
+    value += (bit * ((1 << COUNTER_BITS) - 1) - value) * rate[seen] >> 16
+    return value << _SEEN_BITS | min(seen + 1, _MOST_SEEN)
+
+
+@njit(nogil=True, cache=True, inline="always")
 def learn(counters, contexts, weights, rate, logits, probability, bit):
     """Move the counters of the contexts towards the answer, and the weights to those that were right."""
     error = (bit << PROBABILITY_BITS) - probability
-    target = bit * ((1 << COUNTER_BITS) - 1)
-    for k in range(len(contexts)):
+    for k in range(N_INPUTS):
         weights[k] += error * logits[k] * _RATE + (1 << _RATE_SHIFT - 1) >> _RATE_SHIFT
-        counter = np.int64(counters[contexts[k]])
-        seen, value = counter & _MOST_SEEN, counter >> _SEEN_BITS
-        value += (target - value) * rate[seen] >> 16
-        counters[contexts[k]] = value << _SEEN_BITS | min(seen + 1, _MOST_SEEN)
+        counters[contexts[k]] = learn_one(counters[contexts[k]], rate, bit)

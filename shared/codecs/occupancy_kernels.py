@@ -7,6 +7,9 @@ at (dx, dy, dz), each −1, 0 or 1, stands in column (dx + 1) + 3·(dy + 1) + 9�
 While a node's children are coded, those of the nodes before it are known. All that is known lies in a window of 4×4×4
 voxels of the children's size, the node's own in the middle; voxel (x, y, z) is bit x + 4y + 16z of a uint64. ``there``
 holds the voxels known to be occupied, ``perhaps`` those in nodes that exist and come later.
+
+A node without neighbours may hold a single point, which then is *direct*: its remaining bits stand there as they are,
+and the node has no occupancy (0). Nothing below it can touch another node, so no context misses it.
 """
 
 from __future__ import annotations
@@ -16,8 +19,9 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from .mixing import learn, new_counters, new_weights, predict, tables
-from .range_coder import MOST_BYTES, read_bit, write_bit
+from . import MAX_BITS
+from .mixing import N_INPUTS, learn, learn_one, new_counters, new_weights, predict, predict_one, tables
+from .range_coder import PROBABILITY_BITS, read_bit, with_room, write_bit
 
 
 class Model(NamedTuple):
@@ -31,13 +35,16 @@ class Model(NamedTuple):
     voxels: np.ndarray
 
 
-N_INPUTS = 3
 N_WEIGHT_SETS = 64  # by child, and by how many children came before it
 _OWN, _COUNTS, _PATTERN = 0, 255 * 64, 255 * 64 + 8 * 16 * 16 * 8
-N_CONTEXTS = _PATTERN + 8 * 2**13
+_DIRECT = _PATTERN + 8 * 2**13  # by the number of levels left
+_AGAIN = _DIRECT + MAX_BITS + 1  # by how often the point has stood there
+_MOST_AGAIN = 31
+N_CONTEXTS = _AGAIN + _MOST_AGAIN + 1
+
+_HALF = 1 << PROBABILITY_BITS - 1
 
 _SELF = 13
-_AT_STATE = 3
 
 
 @njit(nogil=True, cache=True)
@@ -67,15 +74,31 @@ def morton_points(keys, bits):
 
 @njit(nogil=True, cache=True)
 def level_occupancy(keys, shift, n_nodes):
-    """(n_nodes,) uint8 of the level whose children are the ascending ``keys >> shift``."""
-    occupancy = np.zeros(n_nodes, np.uint8)
+    """(occupancy, first) of the level whose children are the ascending ``keys >> shift``: (n_nodes,) uint8, and
+    (n_nodes + 1,) int64, the nodes' ranges of keys.
+    """
+    occupancy, first = np.zeros(n_nodes, np.uint8), np.empty(n_nodes + 1, np.int64)
     node, last = -1, np.int64(-1)
-    for key in keys:
-        code = key >> shift + 3
+    for k in range(len(keys)):
+        code = keys[k] >> shift + 3
         if code != last:
             node, last = node + 1, code
-        occupancy[node] |= 1 << (key >> shift & 7)
-    return occupancy
+            first[node] = k
+        occupancy[node] |= 1 << (keys[k] >> shift & 7)
+    first[n_nodes] = len(keys)
+    return occupancy, first
+
+
+@njit(nogil=True, cache=True)
+def without_direct(keys, occupancy, first):
+    """The keys of nodes that have an occupancy."""
+    rest, at = np.empty(len(keys), np.int64), 0
+    for i in range(len(occupancy)):
+        if occupancy[i]:
+            for k in range(first[i], first[i + 1]):
+                rest[at] = keys[k]
+                at += 1
+    return rest[:at]
 
 
 @njit(nogil=True, cache=True)
@@ -167,7 +190,7 @@ def neighbour_voxels():
 
 def new_model() -> Model:
     """Nothing learnt yet."""
-    return Model(new_counters(N_CONTEXTS), new_weights(N_WEIGHT_SETS, N_INPUTS), *tables(), neighbour_voxels())
+    return Model(new_counters(N_CONTEXTS), new_weights(N_WEIGHT_SETS), *tables(), neighbour_voxels())
 
 
 # Around voxel (1, 1, 1): the 26 neighbours that share a face, an edge, a corner. The window of child c is shifted.
@@ -179,19 +202,20 @@ _CORNERS = np.uint64(1 << 0 | 1 << 2 | 1 << 8 | 1 << 10 | 1 << 32 | 1 << 34 | 1 
 
 @njit(nogil=True, cache=True, inline="always")
 def _look_around(neighbours, i, occupancy, voxels):
-    """(there, perhaps, faces) of node i: its window, and a bit for each neighbour across a face."""
-    there, perhaps, faces = np.uint64(0), np.uint64(0), 0
+    """(there, perhaps, faces, alone) of node i: its window, a bit for each node across a face, no neighbour at all."""
+    there, perhaps, faces, alone = np.uint64(0), np.uint64(0), 0, True
     for d in range(27):
         j = neighbours[i, d]
         if j < 0 or d == _SELF:
             continue
+        alone = False
         if j < i:
             there |= voxels[d, occupancy[j]]
         else:
             perhaps |= voxels[d, 255]
     for d in (4, 10, 12, 14, 16, 22):
         faces = faces << 1 | (neighbours[i, d] >= 0)
-    return there, perhaps, faces
+    return there, perhaps, faces, alone
 
 
 @njit(nogil=True, cache=True, inline="always")
@@ -214,16 +238,25 @@ def _set_contexts(contexts, child, own, n_own, there, perhaps, faces):
 
 
 @njit(nogil=True, cache=True)
-def write_level(occupancy, neighbours, model, state, out):
-    """Write the children of all nodes; return ``out``, made longer where it was too short."""
+def write_level(occupancy, first, keys, n_left, neighbours, model, state, out):
+    """Write the children of all nodes, ``n_left`` levels above the points, or their direct points.
+
+    Sets the occupancy of direct ones to 0. Returns ``out``, made longer where it was too short.
+    """
     counters, weights, stretch, squash, rate, voxels = model
     contexts, logits = np.empty(N_INPUTS, np.int64), np.empty(N_INPUTS, np.int64)
     for i in range(len(occupancy)):
-        if state[_AT_STATE] + 8 * MOST_BYTES > len(out):
-            longer = np.empty(2 * len(out) + 1024, np.uint8)
-            longer[: len(out)] = out
-            out = longer
-        there, perhaps, faces = _look_around(neighbours, i, occupancy, voxels)
+        out = with_room(state, out, 1 + 3 * MAX_BITS)
+        there, perhaps, faces, alone = _look_around(neighbours, i, occupancy, voxels)
+        if alone:
+            direct = np.int64(first[i + 1] - first[i] == 1)
+            write_bit(state, out, direct, predict_one(counters[_DIRECT + n_left]))
+            counters[_DIRECT + n_left] = learn_one(counters[_DIRECT + n_left], rate, direct)
+            if direct:
+                for bit in range(3 * n_left - 1, -1, -1):
+                    write_bit(state, out, keys[first[i]] >> bit & 1, _HALF)
+                occupancy[i] = 0
+                continue
         own, n_own = 0, 0
         for child in range(8):
             if child == 7 and own == 0:
@@ -242,13 +275,26 @@ def write_level(occupancy, neighbours, model, state, out):
 
 
 @njit(nogil=True, cache=True)
-def read_level(neighbours, model, state, data):
-    """(m,) uint8 occupancy of the nodes, as ``write_level`` wrote it."""
+def read_level(codes, n_left, neighbours, model, state, data, keys, n_keys):
+    """(occupancy, n_keys) of nodes with (m,) Morton codes, as ``write_level`` wrote them.
+
+    Direct points are added to ``keys[n_keys:]``, which has room for one of each node.
+    """
     occupancy = np.zeros(len(neighbours), np.uint8)
     counters, weights, stretch, squash, rate, voxels = model
     contexts, logits = np.empty(N_INPUTS, np.int64), np.empty(N_INPUTS, np.int64)
     for i in range(len(occupancy)):
-        there, perhaps, faces = _look_around(neighbours, i, occupancy, voxels)
+        there, perhaps, faces, alone = _look_around(neighbours, i, occupancy, voxels)
+        if alone:
+            direct = read_bit(state, data, predict_one(counters[_DIRECT + n_left]))
+            counters[_DIRECT + n_left] = learn_one(counters[_DIRECT + n_left], rate, direct)
+            if direct:
+                key = codes[i]
+                for _ in range(3 * n_left):
+                    key = key << 1 | read_bit(state, data, _HALF)
+                keys[n_keys] = key
+                n_keys += 1
+                continue
         own, n_own = 0, 0
         for child in range(8):
             if child == 7 and own == 0:
@@ -264,4 +310,33 @@ def read_level(neighbours, model, state, data):
                 n_own += 1
                 there |= voxels[_SELF, 1 << child]
         occupancy[i] = own
-    return occupancy
+    return occupancy, n_keys
+
+
+@njit(nogil=True, cache=True)
+def write_counts(counts, model, state, out):
+    """Write how often each point stands there: again, again, no more. Returns ``out``, made longer if too short."""
+    for count in counts:
+        for k in range(1, count + 1):
+            out = with_room(state, out, 1)
+            context = _AGAIN + min(k, _MOST_AGAIN)
+            again = np.int64(k < count)
+            write_bit(state, out, again, predict_one(model.counters[context]))
+            model.counters[context] = learn_one(model.counters[context], model.rate, again)
+    return out
+
+
+@njit(nogil=True, cache=True)
+def read_counts(n, most_points, model, state, data):
+    """(n,) int64, as ``write_counts`` wrote them; None where they add up to more than ``most_points``."""
+    counts, total = np.ones(n, np.int64), n
+    for i in range(n):
+        while total <= most_points:
+            context = _AGAIN + min(counts[i], _MOST_AGAIN)
+            again = read_bit(state, data, predict_one(model.counters[context]))
+            model.counters[context] = learn_one(model.counters[context], model.rate, again)
+            if not again:
+                break
+            counts[i] += 1
+            total += 1
+    return counts if total <= most_points else None

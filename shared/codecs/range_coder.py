@@ -46,6 +46,16 @@ def _next_byte(state, data):
 
 
 @njit(nogil=True, cache=True)
+def with_room(state, out, n_answers):
+    """``out``, or a longer copy where it is too short for so many more answers."""
+    if state[_AT] + n_answers * MOST_BYTES <= len(out):
+        return out
+    longer = np.empty(2 * len(out) + 1024, np.uint8)
+    longer[: len(out)] = out
+    return longer
+
+
+@njit(nogil=True, cache=True)
 def write_bit(state, out, bit, probability):
     """Write an answer of which 1 has this probability, in (0, 2**16); ``out`` has ``MOST_BYTES`` left."""
     middle = state[_LOW] + ((state[_HIGH] - state[_LOW]) * probability >> PROBABILITY_BITS)
