@@ -14,9 +14,10 @@ BITS = 20
 FLOAT32, HIGH, FULL, OUTSIDE = 0, 1, 2, 3
 """How the positions of a block are read: three float32, 10 bits an axis, 20 bits an axis; or not at all."""
 
-HIGH_BITS_ERROR_PX = 1 / 8
-"""A point moves by less than this along each image axis where its low bits are not read: a quarter of what drawing it
-as a whole pixel moves it by. That is the bound; on a surface the mean is a quarter of it (``RESULTS.md``)."""
+HIGH_BITS_ERROR_PX = 1 / 16
+"""A point moves by less than this along each image axis where its low bits are not read; on a surface the mean is a
+quarter of it. Drawing a point as a whole pixel moves it by up to 1/2; but where points are about as dense as pixels,
+1/8 already shows as other holes than before (``RESULTS.md``), and 1/32 would read the low bits of most cells."""
 
 
 class Blocks(NamedTuple):
