@@ -152,7 +152,9 @@ def test_rows_precision_and_culling_hold_their_bounds(seed, eye, width, offset, 
         **{axis: (getattr(points, axis) * np.float32(scale)).astype(np.float32) for axis in "xyz"},
         block_origin=points.block_origin * scale + offset,
     )
-    view = camera(width, 64, np.array(eye) * scale + offset, np.full(3, offset + 0.1 * scale), near=1e-3 * scale)
+    view = camera(
+        width, 64, np.array(eye) * scale + offset, np.array([1.5, -1.7, 1.3]) * scale + offset, near=1e-3 * scale
+    )
     compact = compact_positions(points, 1)
     rows, precision = precision_of(points, compact, view)
     twin_rows, twin_precision = compact_rows(points.block_origin, compact, view)
