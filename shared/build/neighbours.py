@@ -24,9 +24,10 @@ points the largest empty circle has a radius of √(ln n / π) spacings, this di
 the rim of such a circle."""
 RADIUS_MARGIN = 1.1
 """Factor on that distance, so that the discs of evenly random samples leave no hole (1.07 was found to be needed)."""
-RADIUS_CAP = 4.0
-"""A splat is at most this many times as large as the tightest half of its neighbours is wide (``splat_radii``): that of
-a point that stands alone would else be as large as its distance from everything."""
+RADIUS_CAP = 2.0
+CAP_NEIGHBOURS = 32
+"""A splat is at most ``RADIUS_CAP`` times as large as half of this many neighbours' are: that of a point that stands
+apart from a surface, alone or with a few companions, would else be as large as its distance from it."""
 COLLINEAR = 1e-6
 """Neighbours whose second eigenvalue is at most this share of the largest are on a line: they have no normal."""
 _CHUNK = 1 << 13
@@ -54,7 +55,7 @@ class SurfaceRule:
     @property
     def n_neighbours(self) -> int:
         """Neighbours to search for, the point itself not counted."""
-        return max(self.normals * NORMAL_NEIGHBOURS, self.radii * RADIUS_NEIGHBOURS)
+        return max(self.normals * NORMAL_NEIGHBOURS, self.radii * CAP_NEIGHBOURS)
 
 
 def add_surface(
@@ -73,17 +74,25 @@ def add_surface(
     tree = KDTree(positions, balanced_tree=False, compact_nodes=False)
     toward = rule.center - rule.origin if rule.up is None else rule.up
     normal, radius = np.empty(len(first), np.uint32), np.empty(len(first), np.uint8)
+    n, k = len(first), min(rule.n_neighbours + 1, len(first))
+    reach, around = np.full(n + 1, np.nan), np.empty((n, k) if rule.radii else (0, k), np.int32)
 
     def search(begin: int, end: int) -> None:
-        distance, neighbour = map(np.asarray, tree.query(positions[begin:end], k=rule.n_neighbours + 1))
+        distance, neighbour = map(np.asarray, tree.query(positions[begin:end], k=np.arange(1, k + 1)))
         if rule.normals:
             normal[begin:end] = pack_normals(plane_normals(positions, neighbour, rule.up is None, toward))
         if rule.radii:
-            near = slice(1, RADIUS_NEIGHBOURS + 1)
-            radii = splat_radii(positions, np.ascontiguousarray(neighbour[:, near]), distance[:, near])
-            radius[begin:end] = pack_radii(radii * (RADIUS_MARGIN * np.sqrt(share)), rule.edge)
+            around[begin:end] = neighbour
+            reach[begin:end] = distance[:, min(k - 1, RADIUS_NEIGHBOURS)]
 
-    workers.map(search, [(a, b) for a, b in workers.ranges(len(first), pieces=-(-len(first) // _CHUNK))])
+    def cap(begin: int, end: int) -> None:
+        radii = capped_reach(reach, around[begin:end])
+        radius[begin:end] = pack_radii(radii * (RADIUS_MARGIN * np.sqrt(share)), rule.edge)
+
+    pieces = workers.ranges(n, pieces=-(-n // _CHUNK))
+    workers.map(search, pieces)
+    if rule.radii:
+        workers.map(cap, pieces)
     count = np.diff(first, append=len(order))
     columns = dict(points.attributes)
     for name, wanted, values in (("normal", rule.normals, normal), ("radius", rule.radii, radius)):
@@ -158,44 +167,13 @@ def plane_normals(positions, neighbour, outward, toward):
     return normals
 
 
-@njit(nogil=True, cache=True)
-def splat_radii(positions, neighbour, distance):
-    """(m,) float64: distance to the farthest of the neighbours, at most ``RADIUS_CAP`` times their own spread.
+def capped_reach(reach: np.ndarray, around: np.ndarray) -> np.ndarray:
+    """(m,) float64: ``reach`` of (m,) points, at most ``RADIUS_CAP`` times its median over the points around them.
 
-    positions : (n, 3) float64.  neighbour : (m, k) int64 rows of positions, nearest first, n: none.
-    distance : (m, k) float64, from the point to each of them.
-
-    The spread is the least radius around one of the neighbours that holds half of the others: it is about the farthest
-    distance for a point among them, and stays small for one far away, or with a few companions. Not tested with fewer
-    than three neighbours. A point without neighbours has radius 0.
+    reach : (n + 1,) float64, distance from each point to the farthest of a few neighbours; the last is NaN.
+    around : (m, 1 + k) int32, the points themselves and their neighbours; n: none.
     """
-    m, k = neighbour.shape
-    radii = np.zeros(m)
-    apart, ranked = np.empty((k, k)), np.empty(k)
-    for i in range(m):
-        n = 0
-        while n < k and neighbour[i, n] < len(positions):
-            n += 1
-        if n == 0:
-            continue
-        radii[i] = distance[i, n - 1]
-        if n < 3:
-            continue
-        for a in range(n):
-            apart[a, a] = 0.0
-            for b in range(a):
-                total = 0.0
-                for axis in range(3):
-                    total += (positions[neighbour[i, a], axis] - positions[neighbour[i, b], axis]) ** 2
-                apart[a, b] = apart[b, a] = total
-        spread = np.inf
-        for a in range(n):
-            for b in range(n):  # insertion sort of a few
-                at = b
-                while at > 0 and ranked[at - 1] > apart[a, b]:
-                    ranked[at] = ranked[at - 1]
-                    at -= 1
-                ranked[at] = apart[a, b]
-            spread = min(spread, ranked[n // 2])
-        radii[i] = min(radii[i], RADIUS_CAP * np.sqrt(spread))
-    return radii
+    own = reach[around[:, 0]]
+    if around.shape[1] == 1:
+        return own
+    return np.minimum(own, RADIUS_CAP * np.nanmedian(reach[around[:, 1:]], axis=1))

@@ -167,8 +167,8 @@ _FIXED_BYTES = 64 << 20
 _KEY_BYTES = 8
 _SORT_BYTES = 4 + 4 + 10
 """A point's index, a second index while cells are refined, and two and a half stored indices (layered)."""
-NEIGHBOUR_BYTES = 92
-"""A point while neighbours are searched: order, position in that order, tree, results."""
+NEIGHBOUR_BYTES = 248
+"""A point while neighbours are searched: order, position in that order, tree, neighbours, results."""
 _READER_BYTES = 320
 """A point in a reader: file bytes, decoded columns and temporaries, one batch ahead."""
 _MIN_CAPACITY = 1 << 16
