@@ -18,6 +18,7 @@ module                  source
 ``pools``               the same, 3 and 4: vertices, translations and tags
 ``autocorrelation``     the same, 5: the most common translations
 ``pools_reference``     tables and pools in plain form
+``palette``             colours beside points in coded order, a byte each
 ``occupancy``           octree occupancy, entropy coded (not in the papers)
 ``mixing``              adaptive probabilities from several contexts, Mahoney 2005
 ``range_coder``         yes or no at as many bits as its probability says
