@@ -35,7 +35,7 @@ def test_roofline_names_the_slowest_part(monkeypatch, capsys):
     monkeypatch.setattr("splatpipe.cluster.bench.roofline.SIZES", ((64, 48), (33, 70)))
     results = bench_roofline(20_000, repeats=3)
     assert json.loads(json.dumps(results)) == results
-    assert len(results["rows"]) == 2 * 5 * 2
+    assert len(results["rows"]) == 2 * 6 * 2
     for row in results["rows"]:
         parts = {part: ms["median"] for part, ms in row["parts_ms"].items()}
         assert parts[row["limit"]] == max(parts.values())

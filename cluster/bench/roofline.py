@@ -15,9 +15,9 @@ from __future__ import annotations
 import itertools
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -45,7 +45,7 @@ def bench_roofline(n_points: int = 4_000_000, repeats: int = 15) -> dict[str, An
     rows = []
     with ThreadPoolExecutor(threads) as executor:
         for width, height in SIZES:
-            for order, points in bench_cases(n_points, camera_of(0, width, height)):
+            for order, points in _cases(n_points, camera_of(0, width, height)):
                 for compact in (False, True):
                     parts = _Parts(points, camera_of(0, width, height), compact, executor, threads)
                     times = _times(points, parts, repeats)
@@ -72,6 +72,14 @@ def bench_roofline(n_points: int = 4_000_000, repeats: int = 15) -> dict[str, An
         "rows": rows,
         "machine": machine_record(),
     }
+
+
+def _cases(n_points: int, camera: Camera) -> Iterator[tuple[str, ResidentPoints]]:
+    """Those of ``bench_cases``, and the stored order without a colour column."""
+    for order, points in bench_cases(n_points, camera):
+        yield order, points
+        if order == "stored":
+            yield f"{order}, one colour", replace(points, colour=np.broadcast_to(points.colour[0], len(points)))
 
 
 def print_roofline(results: dict[str, Any], console: Any) -> None:
@@ -151,13 +159,15 @@ class _Parts:
         n_of_block = np.diff(self._first)
         if positions:
             low = int(n_of_block[precision == FULL].sum())
-            self.columns_read = [positions.high, positions.low[:low], points.colour]
+            self.columns_read = [positions.high, positions.low[:low]]
             self._high, self._low = positions.high, positions.low
             self._x = self._y = self._z = np.empty(0, np.float32)
         else:
-            self.columns_read = [points.x, points.y, points.z, points.colour]
+            self.columns_read = [points.x, points.y, points.z]
             self._high = self._low = np.empty(0, np.uint32)
             self._x, self._y, self._z = points.x, points.y, points.z
+        if points.colour.strides != (0,):
+            self.columns_read.append(points.colour)
         self.bytes_per_point = 4 * sum(map(len, self.columns_read)) / n
 
         self._place, self._words = np.empty(n, np.int32), np.empty(n, np.uint64)
