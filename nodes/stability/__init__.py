@@ -9,6 +9,7 @@ module          owns
 ``depth``       near and far, points on and behind the camera
 ``clouds``      degenerate clouds: coincident, collinear, one hot octant, …
 ``compact``     positions in fixed point
+``groups``      positions interpolated in linear groups
 ``viewports``   pixel borders and the smallest and largest images
 ``splats``      degenerate and grazing splats, any ε, the smallest and largest images
 ``large``       more points than 32 bits count

@@ -12,6 +12,7 @@ module              owns
 ``neighbourhoods``  normals, splat radii and cell features
 ``cameras``         matrices and poses against 50 digits; keyframe paths
 ``codecs``          what the codecs will be held to
+``linear_groups``   any ε, ends that nearly coincide, matrices that stretch or flatten
 ``grids``           keys, centres and normals against integers and rationals
 ==================  ============================================================
 """

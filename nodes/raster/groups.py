@@ -1,0 +1,299 @@
+"""Drawn from linear groups: end points go through the matrix, inner points are interpolated between them.
+
+Kept points are transformed a *run* at a time, as many partitions as fit the scratch; then each group's inner points are
+V1' + t (V2' − V1') in homogeneous coordinates: four operations a coordinate less than a matrix, one byte read in place
+of six or twelve, and the perspective divide still done for each point. Nothing is expanded in memory but
+``kernels.BATCH`` points at a time, and a frame has the words that ``kernels`` would take for the same points:
+``groups_reference`` is the readable twin.
+
+Groups are clipped by their ends, after Cohen and Sutherland: in homogeneous coordinates every side of the image is a
+linear function, so a segment lies beyond a side where both its ends do. Such a group is not interpolated at all; one
+whose ends are both inside is drawn without looking at its points. The margins are wider than what is rounded, so that
+clipping changes no pixel: points up to the largest side of a point's square outside are still looked at, and those
+less than ``INSIDE_PX`` from the edge too.
+
+Rounding: as of ``pools``, at most ``pools.ROUNDING`` of the sizes of what is added.
+
+Source: Dinerstein, Egbert, Flann, "Linear Grouping", section 2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from ...shared.codecs.group_search import STEPS
+from ...shared.codecs.linear_groups import LinearGroups
+from ...shared.codecs.order import gather_runs
+from ...shared.errors import CodecError
+from .kernels import BATCH, _fetch_add, _pack, _project, _take_pixels, _take_squares
+from .pools import _cell_rows
+
+INSIDE_PX = 1 / 64
+"""An accepted group's ends are this far inside the image; interpolating rounds by at most a quarter of it, in an image
+of 32768 pixels."""
+
+OUTSIDE, NOT_INSIDE = np.uint16(0b11111), np.uint16(0b11111 << 5)
+"""Bits of outcodes: beyond the near plane, left, right, top, bottom side; not certainly within it."""
+
+_BELOW, _ABOVE = np.float32(1 - 2.0**-20), np.float32(1 + 2.0**-20)
+_INSIDE = np.float32(INSIDE_PX)
+_FAR = np.float32(np.finfo(np.float32).max / 2**16)
+_STEP = np.float32(1 / STEPS)
+_IDENTITY = np.eye(3, 4, dtype=np.float32)
+
+
+class GroupCells(NamedTuple):
+    """Cells in the form they are drawn from; their arrays stand one after the other.
+
+    origin : (c, 3) float64, world frame, lower corner of each cell's cube.  step : (c,) float64, size of a grid step,
+    world units; a point is the middle of its bin.  world_side : (c,) float64, side of a point's square, world units.
+    first_run : (c + 1,) int64.  first_kept, first_group, first_inner : (r + 1,) int64, of each run of partitions.
+    x, y, z : (k,) uint16, grid points of the kept points.  kept_colour : (k,) uint32 colour words.
+    v1, v2 : (g,) uint16, among the kept points of the run.  n_inner : (g,) uint16.
+    parameter : (m,) uint8, in 1/256.  inner_colour : (m,) uint32 colour words.
+    """
+
+    origin: np.ndarray
+    step: np.ndarray
+    world_side: np.ndarray
+    first_run: np.ndarray
+    first_kept: np.ndarray
+    first_group: np.ndarray
+    first_inner: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+    z: np.ndarray
+    kept_colour: np.ndarray
+    v1: np.ndarray
+    v2: np.ndarray
+    n_inner: np.ndarray
+    parameter: np.ndarray
+    inner_colour: np.ndarray
+
+    @property
+    def position_bytes(self) -> int:
+        """Bytes that positions take; colours are four a point beside."""
+        arrays = (self.x, self.y, self.z, self.v1, self.v2, self.n_inner, self.parameter)
+        return sum(array.nbytes for array in arrays)
+
+
+def group_cells(
+    cells: Sequence[LinearGroups],
+    origin: np.ndarray,
+    step: np.ndarray,
+    world_side: np.ndarray,
+    colour: np.ndarray,
+) -> GroupCells:
+    """Cells put together. Arrays as of ``GroupCells``; ``colour`` in coded order, cell after cell.
+
+    The groups of a run stand by size: loops of the same length one after the other are predicted (measured: half the
+    time of interpolating).
+    Raises CodecError for grid points of more than 16 bits an axis.
+    """
+    kept = _joined([cell.kept for cell in cells], np.empty((0, 3), np.uint32))
+    if kept.max(initial=0) >> 16:
+        raise CodecError(
+            f"linear groups: found grid points up to {kept.max()}, expected at most 16 bits an axis to draw"
+        )
+    first_run, runs, ends, sizes, parameters, kept_colours, inner_colours = [0], [], [], [], [], [], []
+    at = np.zeros(4, np.int64)
+    for cell in cells:
+        starts = _runs(cell.first_kept)
+        first_kept, first_group = cell.first_kept[starts], cell.first_group[starts]
+        first = np.column_stack([first_kept, first_group, cell.first_inner[first_group]])
+        runs.append(first[:-1] + at[:3])
+        first_run.append(first_run[-1] + len(first) - 1)
+        n_groups, n_inner = np.diff(first_group), np.diff(cell.first_inner)
+        by_size = np.lexsort((n_inner, np.repeat(np.arange(len(n_groups)), n_groups)))
+        ends.append((cell.ends - np.repeat(first_kept[:-1], n_groups)[:, None])[by_size])
+        sizes.append(n_inner[by_size])
+        of_kept, of_inner = np.split(colour[at[3] : at[3] + len(cell)], [len(cell.kept)])
+        kept_colours.append(of_kept)
+        inner_colours.append(gather_runs(of_inner, cell.first_inner, n_inner, by_size))
+        parameters.append(gather_runs(cell.parameter, cell.first_inner, n_inner, by_size))
+        at += [*first[-1], len(cell)]
+    table = _joined([*runs, at[None, :3]], np.empty((0, 3), np.int64))
+    both_ends = _joined(ends, np.empty((0, 2), np.int64)).astype(np.uint16)
+    none = np.empty(0, np.int64)
+    first_kept, first_group, first_inner = map(np.ascontiguousarray, table.T)
+    x, y, z = (np.ascontiguousarray(column, np.uint16) for column in kept.T)
+    v1, v2 = map(np.ascontiguousarray, both_ends.T)
+    return GroupCells(
+        np.ascontiguousarray(origin, np.float64),
+        np.ascontiguousarray(step, np.float64),
+        np.ascontiguousarray(world_side, np.float64),
+        np.array(first_run, np.int64),
+        first_kept,
+        first_group,
+        first_inner,
+        x,
+        y,
+        z,
+        _joined(kept_colours, none).astype(np.uint32),
+        v1,
+        v2,
+        _joined(sizes, none).astype(np.uint16),
+        _joined(parameters, np.empty(0, np.uint8)),
+        _joined(inner_colours, none).astype(np.uint32),
+    )
+
+
+def _joined(arrays: Sequence[np.ndarray], empty: np.ndarray) -> np.ndarray:
+    return np.concatenate([empty, *arrays])
+
+
+def _runs(first_kept: np.ndarray) -> np.ndarray:
+    """Partitions at which runs start, and the number of partitions: as many in turn as have ``BATCH`` kept points."""
+    starts = [0]
+    while starts[-1] < len(first_kept) - 1:
+        starts.append(int(np.searchsorted(first_kept, first_kept[starts[-1]] + BATCH, side="right")) - 1)
+    return np.array(starts)
+
+
+class _Scratch(NamedTuple):
+    """Kept points of a run, X, Y, W and outcodes; then points on their way to the framebuffer."""
+
+    kept_x: np.ndarray
+    kept_y: np.ndarray
+    kept_w: np.ndarray
+    code: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+    w: np.ndarray
+    colour: np.ndarray
+    place: np.ndarray
+    depth: np.ndarray
+    packed: np.ndarray
+
+
+@njit(nogil=True, cache=True)
+def draw_groups(groups, cells, frustum, view, words, dirty, turn, counter):
+    """Draw cells into one framebuffer until none is left.
+
+    groups : GroupCells.  cells : (k,) int64, those to draw.  The rest as of ``kernels.draw``.
+    """
+    floats = np.empty((7, BATCH), np.float32)
+    scratch = _Scratch(
+        floats[0],
+        floats[1],
+        floats[2],
+        np.empty(BATCH, np.uint16),
+        floats[3],
+        floats[4],
+        floats[5],
+        np.empty(BATCH, np.uint32),
+        np.empty(3 * BATCH, np.int32),
+        floats[6],
+        np.empty(BATCH, np.uint64),
+    )
+    rows = np.empty((3, 4), np.float32)
+    begin = _fetch_add(counter, turn)
+    while begin < len(cells):
+        for k in range(begin, min(begin + turn, len(cells))):
+            c = cells[k]
+            _cell_rows(groups.origin, groups.step, c, frustum, rows)
+            side_at_one = np.float32(groups.world_side[c] * frustum.focal_px)
+            for run in range(groups.first_run[c], groups.first_run[c + 1]):
+                _draw_run(groups, run, rows, side_at_one, view, words, dirty, scratch)
+        begin = _fetch_add(counter, turn)
+
+
+@njit(nogil=True, cache=True)
+def _draw_run(groups, run, rows, side_at_one, view, words, dirty, scratch):
+    """Draw the kept points of a run, then the inner points of those of its groups that are not rejected."""
+    first, count = groups.first_kept[run], groups.first_kept[run + 1] - groups.first_kept[run]
+    kept_x, kept_y, kept_w, code = scratch.kept_x, scratch.kept_y, scratch.kept_w, scratch.code
+    x, y, w, colour = scratch.x, scratch.y, scratch.w, scratch.colour
+    _transform(groups.x, groups.y, groups.z, first, count, rows, kept_x, kept_y, kept_w)
+    any_code, common_code = outcodes(kept_x, kept_y, kept_w, count, view, code)
+    if common_code & OUTSIDE:
+        return
+    _take(kept_x, kept_y, kept_w, count, groups.kept_colour, first, any_code, side_at_one, view, words, dirty, scratch)
+    gaps = any_code & OUTSIDE != 0  # some groups may be rejected: colours of the others are put together
+    n, q, any_code = 0, groups.first_inner[run], np.uint16(0)
+    for g in range(groups.first_group[run], groups.first_group[run + 1]):
+        a, b, m = np.uintp(groups.v1[g]), np.uintp(groups.v2[g]), np.int64(groups.n_inner[g])
+        if code[a] & code[b] & OUTSIDE:
+            q += m
+            continue
+        if n + m > BATCH:
+            colours, first = (colour, 0) if gaps else (groups.inner_colour, q - n)
+            _take(x, y, w, n, colours, first, any_code, side_at_one, view, words, dirty, scratch)
+            n, any_code = 0, np.uint16(0)
+        any_code |= code[a] | code[b]
+        dx, dy, dw = kept_x[b] - kept_x[a], kept_y[b] - kept_y[a], kept_w[b] - kept_w[a]
+        for i in range(m):
+            t = np.float32(groups.parameter[np.uintp(q) + np.uintp(i)]) * _STEP
+            k = np.uintp(n) + np.uintp(i)
+            x[k], y[k], w[k] = kept_x[a] + t * dx, kept_y[a] + t * dy, kept_w[a] + t * dw
+        if gaps:
+            for i in range(m):
+                colour[n + i] = groups.inner_colour[q + i]
+        n += m
+        q += m
+    colours, first = (colour, 0) if gaps else (groups.inner_colour, q - n)
+    _take(x, y, w, n, colours, first, any_code, side_at_one, view, words, dirty, scratch)
+
+
+@njit(nogil=True, cache=True)
+def _transform(x, y, z, first, n, rows, out_x, out_y, out_w):
+    """X, Y and W of ``n`` grid points from ``first`` on."""
+    for i in range(n):
+        j = np.uintp(first) + np.uintp(i)
+        a, b, c = np.float32(x[j]), np.float32(y[j]), np.float32(z[j])
+        out_x[i] = rows[0, 0] * a + rows[0, 1] * b + rows[0, 2] * c + rows[0, 3]
+        out_y[i] = rows[1, 0] * a + rows[1, 1] * b + rows[1, 2] * c + rows[1, 3]
+        out_w[i] = rows[2, 0] * a + rows[2, 1] * b + rows[2, 2] * c + rows[2, 3]
+
+
+@njit(nogil=True, cache=True)
+def outcodes(x, y, w, n, view, code):
+    """Fill in the outcodes of ``n`` points; return their union and what all have in common.
+
+    A segment is rejected where its ends share a bit of ``OUTSIDE``, accepted where neither has one of ``NOT_INSIDE``. A
+    value that is not a number is neither beyond a side nor within it.
+    """
+    any_code, common_code = np.uint16(0), np.uint16(0xFFFF)
+    margin = view.largest
+    for i in range(n):
+        a, b, c = x[i], y[i], w[i]
+        beyond = np.uint16(c < view.near * _BELOW)
+        beyond |= np.uint16(a < -margin * c) << np.uint16(1)
+        beyond |= np.uint16(a > (view.width + margin) * c) << np.uint16(2)
+        beyond |= np.uint16(b < -margin * c) << np.uint16(3)
+        beyond |= np.uint16(b > (view.height + margin) * c) << np.uint16(4)
+        within = np.uint16((c >= view.near * _ABOVE) & (c <= _FAR))
+        within |= np.uint16(a >= _INSIDE * c) << np.uint16(1)
+        within |= np.uint16(a <= (view.width - _INSIDE) * c) << np.uint16(2)
+        within |= np.uint16(b >= _INSIDE * c) << np.uint16(3)
+        within |= np.uint16(b <= (view.height - _INSIDE) * c) << np.uint16(4)
+        code[i] = beyond | (within << np.uint16(5)) ^ NOT_INSIDE
+        any_code |= code[i]
+        common_code &= code[i]
+    return any_code, common_code
+
+
+@njit(nogil=True, cache=True)
+def _take(x, y, w, n, colours, first, any_code, side_at_one, view, words, dirty, scratch):
+    """Take ``n`` points in the image's frame with the colours from ``first`` on; ``any_code``: of all their ends."""
+    if view.one_pixel and not any_code & NOT_INSIDE:
+        _place_inside(x, y, w, n, view, scratch.place)
+        _pack(w, colours, first, n, scratch.packed)
+    else:
+        _project(x, y, w, 0, n, _IDENTITY, side_at_one, view, len(words), scratch.place, scratch.depth)
+        _pack(scratch.depth, colours, first, n, scratch.packed)
+    if view.one_pixel:
+        _take_pixels(scratch.place, scratch.packed, n, words, dirty)
+    else:
+        _take_squares(scratch.place, scratch.packed, n, view, words, dirty)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _place_inside(x, y, w, n, view, place):
+    """As ``kernels._project_pixels``, of points that are known to be in the image."""
+    for i in range(n):
+        place[i] = np.int32(y[i] / w[i]) * view.pitch + np.int32(x[i] / w[i])

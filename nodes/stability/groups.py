@@ -1,0 +1,46 @@
+"""Frames drawn from linear groups: cells of any size and place, eyes among the points, near planes at the eye."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...shared.camera import look_at, perspective_camera
+from ...shared.codecs.linear_groups import LinearGroupCodec
+from ...shared.stability.case import cases, expect
+from ..raster import ResidentPoints
+from ..raster.groups import group_cells
+from ..raster.groups_reference import project_groups
+
+_VIEWS = {
+    "cell of 1e-9": (1e-9, 0.0, (0.5, -2.0, 1.5)),
+    "cell of 1e9": (1e9, 0.0, (0.5, -2.0, 1.5)),
+    "6.4e6 m away": (1.0, 6.4e6, (0.5, -2.0, 1.5)),
+    "seen along the sheet": (1.0, 0.0, (0.5, -2.0, 0.5001)),
+    "eye among the points": (1.0, 0.0, (0.5, 0.1, 0.6)),
+}
+_BOUNDS = dict.fromkeys(_VIEWS, 0.01) | {"eye among the points": 0.05}
+
+
+@cases("linear groups/image position", bounds=_BOUNDS, unit="px")
+def image_position(name: str) -> float:
+    """Image position of points whose ends were projected and that were interpolated, in float32 as the kernel rounds,
+    against float64; 1920×1080.
+    """
+    edge, shift, eye = _VIEWS[name]
+    u, v = np.random.default_rng(73).uniform(0, 1, (2, 4000))
+    sheet = np.column_stack([u, v, 0.5 + 0.01 * np.sin(5 * u) * np.cos(4 * v)])
+    cell, _ = LinearGroupCodec(100.0).group((sheet * 2**16).astype(np.int64), 16)
+    expect(len(cell.parameter) > 1000, "many points are grouped")
+    none = np.zeros(len(cell), np.uint32)
+    groups = group_cells([cell], np.full((1, 3), shift), np.array([edge / 2**16]), np.zeros(1), none)
+    pose = look_at(np.array(eye) * edge + shift, np.array([0.5, 0.5, 0.5]) * edge + shift, np.array([0.0, 0.0, 1.0]))
+    camera = perspective_camera(
+        frame=0, world_from_camera=pose, fov_y_rad=0.9, width=1920, height=1080, near=0.01 * edge
+    )
+    points = ResidentPoints(none, none, none, none, np.zeros(1, np.int64), np.zeros((1, 3)))
+    index = np.arange(len(cell))
+    exact_u, exact_v, w = project_groups(groups)(points, camera, index)
+    u, v, _ = project_groups(groups, np.float32)(points, camera, index)
+    seen = (w >= camera.near) & (exact_u >= 0) & (exact_u < 1920) & (exact_v >= 0) & (exact_v < 1080)
+    expect(seen.sum() > 500, "points are in the image")
+    return float(np.hypot(u - exact_u, v - exact_v)[seen].max())
