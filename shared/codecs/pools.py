@@ -103,13 +103,19 @@ def greedy_pools(
     pools: list[Pool] = []
     covered = [place[:0]]
     while len(pools) < n_pools:
-        rows = best_column(place, offset, left)
+        table = vertex_table(place, offset, left)
+        best = table[np.bitwise_count(table).sum(axis=1).argmax()]
+        rows = np.flatnonzero(np.unpackbits(best.view(np.uint8), bitorder="little"))
         choices = []
         for w in WIDTHS if width is None else (width,):
-            chosen, tags, targets, left_then = _fill(place, offset[rows[:w]], left)
-            pool = Pool(points[chosen].astype(np.uint8), translations[rows[:w]].astype(np.int8), tags)
+            k = min(w, len(rows))
+            sums = np.bitwise_count(table & _mask(rows[:k], table.shape[1])).sum(axis=1, dtype=np.int16)
+            order = np.argsort(-sums, kind="stable")[: np.count_nonzero(sums > LEAST_NEW * k)]
+            n_chosen, tags, targets, left_then = _fill(place, offset[rows[:k]], left, order)
+            vertices = points[order[:n_chosen]].astype(np.uint8)
+            pool = Pool(vertices, translations[rows[:k]].astype(np.int8), tags[:n_chosen])
             choices.append((pool.saved_bytes, -w, pool, targets, left_then))
-            if w >= len(rows):
+            if k == len(rows):
                 break
         saved_bytes, _, pool, targets, left_then = max(choices, key=lambda choice: choice[:2])
         if saved_bytes < least_saved:
@@ -120,35 +126,34 @@ def greedy_pools(
     return pools, np.concatenate(covered), np.flatnonzero(left[place])
 
 
+def _mask(rows: np.ndarray, n_words: int) -> np.ndarray:
+    """(n_words,) uint32 in which the bits of the rows are set."""
+    bits = np.zeros(TAG_BITS * n_words, np.uint8)
+    bits[rows] = 1
+    return np.packbits(bits, bitorder="little").view("<u4").astype(np.uint32)
+
+
 @njit(nogil=True, cache=True)
-def best_column(place, offset, left):
-    """The rows, ascending, of the first of the columns with most ones."""
-    best, most = 0, -1
+def vertex_table(place, offset, left):
+    """(n, ⌈m / 32⌉) uint32: the vertex–transformation table, its columns as tags: a bit where a point left is met."""
+    table = np.zeros((len(place), (len(offset) + TAG_BITS - 1) // TAG_BITS), np.uint32)
     for i in range(len(place)):
-        ones = 0
-        for o in offset:
-            ones += left[place[i] + o]
-        if ones > most:
-            best, most = i, ones
-    return np.flatnonzero(np.array([left[place[best] + o] for o in offset]))
+        for t in range(len(offset)):
+            table[i, t // TAG_BITS] |= np.uint32(left[place[i] + offset[t]]) << np.uint32(t % TAG_BITS)
+    return table
 
 
 @njit(nogil=True, cache=True)
-def _fill(place, offset, left):
-    """A pool with these translations: its vertices, tags, the places it covers in its order, and what is left then."""
-    n, k = len(place), len(offset)
-    sums = np.zeros(n, np.int64)
-    for i in range(n):
-        for o in offset:
-            sums[i] += left[place[i] + o]
-    order = _descending(sums, k)
+def _fill(place, offset, left, order):
+    """A pool with these translations: which of the vertices in ``order`` stay (their number, put to its front), their
+    tags, the places they cover in the pool's order, and what is left then.
+    """
+    k = len(offset)
     left = left.copy()
-    tags = np.zeros((n, (k + TAG_BITS - 1) // TAG_BITS), np.uint32)
-    covered = np.empty(n, np.int64)
+    tags = np.zeros((len(order), (k + TAG_BITS - 1) // TAG_BITS), np.uint32)
+    covered = np.empty(len(place), np.int64)
     n_chosen, n_covered = 0, 0
     for i in order:
-        if sums[i] <= LEAST_NEW * k:
-            break
         new = 0
         for o in offset:
             new += left[place[i] + o]
@@ -163,18 +168,4 @@ def _fill(place, offset, left):
                 n_covered += 1
         order[n_chosen] = i
         n_chosen += 1
-    return order[:n_chosen].copy(), tags[:n_chosen].copy(), covered[:n_covered], left
-
-
-@njit(nogil=True, cache=True)
-def _descending(sums, largest):
-    """The stable order of sums in 0 … largest, largest first: a counting sort."""
-    first = np.zeros(largest + 2, np.int64)
-    for value in sums:
-        first[largest - value + 1] += 1
-    first = np.cumsum(first)
-    order = np.empty(len(sums), np.int64)
-    for i in range(len(sums)):
-        order[first[largest - sums[i]]] = i
-        first[largest - sums[i]] += 1
-    return order
+    return n_chosen, tags, covered[:n_covered], left
