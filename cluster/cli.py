@@ -335,6 +335,45 @@ def bench_splats(
     _report(measure(scenes, size=size, views=views, repeats=repeats, pictures=pictures), print_splats, json)
 
 
+@bench_app.command("codecs")
+def bench_codecs(
+    inputs: Annotated[
+        list[str] | None, typer.Argument(help="Scenes, point files, folders or globs; default: a generated surface.")
+    ] = None,
+    bits: Annotated[int, typer.Option(help="Of the grid in a cell, an axis.", min=1, max=16)] = 7,
+    cells: Annotated[int, typer.Option(help="At most so many cells of each scene, evenly spread.", min=1)] = 64,
+    leaves: Annotated[bool, typer.Option("--leaves", help="Leaves only, not every cell that owns points.")] = False,
+    points_per_cell: Annotated[int, typer.Option(help="Of scenes built from point files.", min=1)] = 4096,
+    epsilon: Annotated[
+        float, typer.Option(help="ε of linear groups, % of the scene's longest side.", min=0, max=100)
+    ] = 0.5,
+    size: Annotated[int, typer.Option(help="Width and height, pixels.", min=16, max=8192)] = 1024,
+    repeats: Annotated[int, typer.Option(help="Times that each is measured.", min=1)] = 5,
+    json: JsonOption = None,
+) -> None:
+    """Codecs of cells beside float32 and 10-bit fixed point: bytes, encode, decode, error, frame time.
+
+    Exit status 1 if what is decoded is not what was encoded.
+
+    Example: `splatpipe bench codecs lion.scene dragon.ply --json codecs.json`
+    """
+    from .bench.codecs import bench_codecs as measure
+    from .bench.codecs import print_codecs
+
+    results = measure(
+        inputs or [],
+        bits=bits,
+        most_cells=cells,
+        leaves=leaves,
+        points_per_cell=points_per_cell,
+        epsilon=epsilon / 100,
+        size=size,
+        repeats=repeats,
+    )
+    _report(results, print_codecs, json)
+    raise typer.Exit(int(any(row["failed"] for row in results["rows"])))
+
+
 @bench_app.command("build")
 def bench_build(
     points: Annotated[int, typer.Option(help="Number of points of the LAS file.", min=1000)] = 20_000_000,

@@ -133,12 +133,8 @@ class CpuRasterizer:
         return kernels.View(near, columns, rows, smallest, largest, pitch, self._sides == (1, 1))
 
     def _clean_framebuffers(self, n_points: int) -> np.ndarray:
-        """(t, height · pitch + 1) empty framebuffers, as many as make the frame shortest.
-
-        With t of them the threads draw n_points / t points each and merge t · pixels / threads words each.
-        """
-        best = math.sqrt(MERGED_PIXELS_PER_POINT * n_points * self._threads / self._frame.size)
-        n = min(max(round(best), 1), self._threads)
+        """(t, height · pitch + 1) empty framebuffers, as many as make the frame shortest."""
+        n = framebuffers_worth(n_points, self._threads, self._frame.size)
         if n > self._n_clean:
             self._framebuffers[self._n_clean : n, :-1] = FRAMEBUFFER_EMPTY
             self._framebuffers[self._n_clean : n, -1] = 0
@@ -160,6 +156,15 @@ class CpuRasterizer:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def framebuffers_worth(n_points: int, threads: int, n_pixels: int) -> int:
+    """How many framebuffers make a frame shortest, 1 … ``threads``.
+
+    With t of them the threads draw n_points / t points each and merge t · n_pixels / threads words each.
+    """
+    best = math.sqrt(MERGED_PIXELS_PER_POINT * n_points * threads / n_pixels)
+    return min(max(round(best), 1), threads)
 
 
 def _read_only(column: np.ndarray) -> np.ndarray:
