@@ -79,6 +79,8 @@ def decode(data: np.ndarray, bits: int, most_points: int) -> np.ndarray:
     keys, n_keys = np.empty(n, np.int64), 0
     for level in range(bits):
         occupancy, n_keys = read_level(codes, bits - level, neighbours, model, state, data, keys, n_keys)
+        if n_keys < 0:
+            raise CodecError(f"coded points: found {len(data)} bytes for {n} points, expected more")
         n_children = count_children(occupancy)
         found = n_keys + n_children
         if found > n or (level == bits - 1 and found != n):

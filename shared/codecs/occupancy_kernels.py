@@ -21,7 +21,7 @@ from numba import njit
 
 from . import MAX_BITS
 from .mixing import N_INPUTS, learn, learn_one, new_counters, new_weights, predict, predict_one, tables
-from .range_coder import PROBABILITY_BITS, read_bit, with_room, write_bit
+from .range_coder import PROBABILITY_BITS, ran_out, read_bit, with_room, write_bit
 
 
 class Model(NamedTuple):
@@ -276,7 +276,7 @@ def write_level(occupancy, first, keys, n_left, neighbours, model, state, out):
 
 @njit(nogil=True, cache=True)
 def read_level(codes, n_left, neighbours, model, state, data, keys, n_keys):
-    """(occupancy, n_keys) of nodes with (m,) Morton codes, as ``write_level`` wrote them.
+    """(occupancy, n_keys) of nodes with (m,) Morton codes, as ``write_level`` wrote them; n_keys −1 where data run out.
 
     Direct points are added to ``keys[n_keys:]``, which has room for one of each node.
     """
@@ -310,6 +310,8 @@ def read_level(codes, n_left, neighbours, model, state, data, keys, n_keys):
                 n_own += 1
                 there |= voxels[_SELF, 1 << child]
         occupancy[i] = own
+        if ran_out(state, data):
+            return occupancy, -1
     return occupancy, n_keys
 
 
@@ -328,7 +330,7 @@ def write_counts(counts, model, state, out):
 
 @njit(nogil=True, cache=True)
 def read_counts(n, most_points, model, state, data):
-    """(n,) int64, as ``write_counts`` wrote them; None where they add up to more than ``most_points``."""
+    """(n,) int64, as ``write_counts`` wrote them; None where data run out or add up to more than ``most_points``."""
     counts, total = np.ones(n, np.int64), n
     for i in range(n):
         while total <= most_points:
@@ -339,4 +341,6 @@ def read_counts(n, most_points, model, state, data):
                 break
             counts[i] += 1
             total += 1
+        if ran_out(state, data):
+            return None
     return counts if total <= most_points else None

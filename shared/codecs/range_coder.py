@@ -86,6 +86,12 @@ def read_bit(state, data, probability):
     return np.int64(bit)
 
 
+@njit(nogil=True, cache=True)
+def ran_out(state, data):
+    """Whether more was read than a writer ever leaves out at the end."""
+    return state[_AT] > len(data) + MOST_BYTES
+
+
 def _end(state: np.ndarray) -> bytes:
     """The fewest bytes that, followed by zeros, lie in the interval."""
     low, high = int(state[_LOW]), int(state[_HIGH])
