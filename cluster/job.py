@@ -11,7 +11,7 @@ from ..nodes.culling import CullingNode
 from ..nodes.picture.compose import Composer, Picture, PictureSettings
 from ..nodes.point_filter import PointFilter
 from ..nodes.raster import MAX_SIDE_PX, PointSize, Rasterizer, ResidentPoints, SplatSettings
-from ..nodes.raster.choose import make_rasterizer
+from ..nodes.raster.choose import check_style, make_rasterizer
 from ..nodes.raster.cpu import kernels_cached
 from ..nodes.render import RenderNode, Wanted, load_points
 from ..nodes.sampling import SamplingNode
@@ -64,6 +64,8 @@ class Job:
             spacing=render.point_size_adaptive,
             point_filter=self.point_filter,
         )
+        self.wanted.check(self.scene)
+        check_style(render.rasterizer, self.splats)
         self.background = parse_colour(render.background, "render.background")
         self.colouring = Colouring.choose(
             self.scene, render.colour, render.colormap, render.colour_range, render.class_colours

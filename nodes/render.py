@@ -56,6 +56,13 @@ class Wanted:
     spacing: bool = False
     point_filter: PointFilter = field(default_factory=PointFilter)
 
+    def check(self, scene: Scene) -> None:
+        """Raise StoreError if the scene was built without what is wanted. Cost: none, it looks at no array."""
+        if self.splats and not scene.info.splats:
+            raise StoreError(f"{scene.path}: no radii and normals of splats: build it with --splats")
+        if self.features and not scene.info.features:
+            raise StoreError(f"{scene.path}: no features of cells: build it with --features")
+
 
 def load_points(scene: Scene, colouring: Colouring, wanted: Wanted = Wanted(), *, verify: bool) -> ResidentPoints:
     """The render rank's half of a scene, coloured. Positions (and rgb) are mapped from the files, not copied, but for
@@ -64,8 +71,7 @@ def load_points(scene: Scene, colouring: Colouring, wanted: Wanted = Wanted(), *
     verify : hold the checksums of the arrays it reads against the scene first: one read of each.
     Raises StoreError naming the array that is damaged or that the scene was built without.
     """
-    if wanted.splats and not scene.info.splats:
-        raise StoreError(f"{scene.path}: no radii and normals of splats: build it with --splats")
+    wanted.check(scene)
     if verify:
         attributes = [colouring.attribute, "classification" if wanted.point_filter.classes else None]
         attributes += ["normal", "radius"] if wanted.splats else []

@@ -165,6 +165,7 @@ def run(folder: Path, text: str, *settings: str) -> subprocess.CompletedProcess[
         ("[scene]\npath = 'copy.scene'", ["filter.boxes=[{ lower = [0, 0, 9], upper = [1, 1, 1] }]"], ["filter.boxes[0]", "lower z = 9"]),
         ("[scene]\npath = 'copy.scene'", ["filter.boxes=[{ lower = [0, 0, 0] }]"], ["filter.boxes.0.upper"]),
         ("[scene]\npath = 'copy.scene'", ["filter.boxes=[{ lower = [0, 0, 0], upper = [1, 1, 1], kep = 'inside' }]"], ["did you mean filter.boxes.keep"]),
+        ("[scene]\npath = 'copy.scene'", ["render.style=splats"], ["copy.scene", "build it with --splats"]),
         ("[scene]\npath = 'copy.scene'", ["output.directory=run.toml/x"], ["run.toml/x"]),
         ("[scene]\npath = 'copy.scene'", ["camera.path=keyframes"], ["camera.keyframes"]),
         ("[scene]\npath = 'copy.scene'", ["camera.path=poses"], ["camera.poses"]),

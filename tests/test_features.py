@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import KDTree
+from splatpipe.cluster.job import Job
 from splatpipe.cluster.scenes import info_command
 from splatpipe.nodes.render import Wanted, load_points
 from splatpipe.shared.build import BuildSettings, build_scene
@@ -24,7 +25,8 @@ from splatpipe.shared.build.features import (
     classify,
 )
 from splatpipe.shared.colour import Colouring
-from splatpipe.shared.errors import StoreError
+from splatpipe.shared.config import parse_config
+from splatpipe.shared.errors import ConfigError, StoreError
 from splatpipe.shared.octree import CORNER, EDGE, FLAT
 from splatpipe.shared.points import radius_table
 from splatpipe.shared.store import Scene
@@ -260,6 +262,16 @@ def test_what_a_scene_was_built_without_is_said(tmp_path):
         load_points(scene, colouring, Wanted(splats=True), verify=False)
     with pytest.raises(StoreError, match="build it with --features"):
         load_points(scene, colouring, Wanted(features=True), verify=False)
+
+
+def test_a_run_that_cannot_be_drawn_is_refused_before_it_starts(tmp_path):
+    build(tmp_path / "s", cube_surface(500, np.random.default_rng(8)), splats=True, features=False)
+    splats = {"scene": {"path": str(tmp_path / "s")}, "render": {"style": "splats"}}
+    assert Job(parse_config(splats)).splats
+    with pytest.raises(StoreError, match="build it with --features"):
+        Job(parse_config(splats | {"splats": {"features": True}}))
+    with pytest.raises(ConfigError, match="'gl-points' draws no splats"):
+        Job(parse_config(splats | {"render": {"style": "splats", "rasterizer": "gl-points"}}))
 
 
 @pytest.mark.parametrize("array", ["attr_normal", "attr_radius", "cell_feature", "cell_quad"])

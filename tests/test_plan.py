@@ -106,6 +106,13 @@ def test_what_is_asked_for_is_kept(config, scenes):
     assert kept >= {named.CHECKSUMS, named.PNG, named.FILM, "stride of render-points entries"}
 
 
+def test_compact_positions_are_left_out_where_nothing_is_drawn_from_them(config, scenes):
+    job = job_of(config, f"scene.path={scenes}/city", "render.positions=compact", "render.rasterizer=gl")
+    found = {part.what: part for part in parts(job, Workload.of_look(job), Decision("single", "so"))}
+    assert found["compact positions"].left_out
+    assert found["compact positions"].why.startswith("rasterizer gl")
+
+
 def test_what_a_picture_asks_for_is_kept_and_what_it_costs_is_said(config, scenes):
     job = job_of(
         config,

@@ -292,6 +292,14 @@ def test_drawn_cells_are_those_that_share_a_point(data):
     assert drawn_cells(cells, entries).tolist() == expected
 
 
+def test_a_depth_offset_beyond_float32_is_the_largest_there_is():
+    points, huge = sphere(50, 0.1), SplatSettings(depth_offset=1e300)
+    with np.errstate(over="raise"), CpuSplatRasterizer(points, 20, 20, huge) as rasterizer:
+        found = rasterizer.draw(camera(20, 20), all_of(points)).copy()
+    with CpuSplatRasterizer(points, 20, 20, SplatSettings(depth_offset=1e30)) as rasterizer:
+        assert np.array_equal(found, rasterizer.draw(camera(20, 20), all_of(points)))
+
+
 def test_what_splats_need_is_asked_for():
     points = sphere(10, 0.1)
     with pytest.raises(InputError, match="splats: found points without normals or radii"):

@@ -158,6 +158,10 @@ def _adaptive_size(job: Job, work: Workload) -> Part:
 
 def _compact_positions(job: Job) -> Part:
     cost_s = COSTS.compact_s * job.scene.info.n_stored
+    rasterizer = resolve_rasterizer(job.config.render.rasterizer)
+    if job.compact and (job.splats or rasterizer != "cpu"):
+        why = f"{'splats' if job.splats else f'rasterizer {rasterizer}'}: only points on cpu are drawn from them"
+        return Part("compact positions", True, why, cost_s, "s of loading")
     if job.compact:
         why = "render.positions is compact: 4 or 8 bytes a point are read for its 12"
         return Part("compact positions", False, why, cost_s, "s of loading")
@@ -198,7 +202,7 @@ def _attributes(job: Job) -> list[Part]:
 
 
 def _codec() -> Part:
-    return Part("codecs", True, "the scene holds plain float32 positions, drawn as they are", None, "ms/frame")
+    return Part("codecs", True, "the scene holds plain float32 positions", None, "ms/frame")
 
 
 def _flatness(job: Job) -> Part:

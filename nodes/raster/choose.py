@@ -29,6 +29,7 @@ def make_rasterizer(
     Raises ConfigError for another name or a style that it does not draw, DeviceError if OpenGL is asked for and not
     there.
     """
+    check_style(name, splats)
     match resolve_rasterizer(name), splats:
         case "cpu", None:
             from .cpu import CpuRasterizer
@@ -50,9 +51,13 @@ def make_rasterizer(
             from .gl import GlPointsRasterizer
 
             return GlPointsRasterizer(points, width, height, size)
-        case "gl-points", _:
-            raise ConfigError("render.rasterizer = 'gl-points' draws no splats, expected auto, cpu or gl")
     raise ConfigError(f"render.rasterizer = {name!r}, expected one of {', '.join(RASTERIZERS)}")
+
+
+def check_style(name: str, splats: SplatSettings | None) -> None:
+    """Raise ConfigError if the rasterizer of this name does not draw splats and is to."""
+    if name == "gl-points" and splats:
+        raise ConfigError("render.rasterizer = 'gl-points' draws no splats, expected auto, cpu or gl")
 
 
 def resolve_rasterizer(name: str) -> str:

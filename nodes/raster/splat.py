@@ -143,7 +143,7 @@ class CpuSplatRasterizer:
         rotation = frame.rotation.astype(np.float32)
         pinhole = tuple(map(np.float32, (*frame.focal, *frame.center, MAX_SPLAT_PX / camera.focal_px)))
         view = tuple(map(np.float32, (camera.near, camera.width, camera.height)))
-        behind = np.float32(self._settings.depth_offset)
+        behind = np.float32(min(self._settings.depth_offset, float(np.finfo(np.float32).max)))
         counter = np.zeros(1, np.int64)
         to_screen = (self._rows, rotation, pinhole, view, self._radii, behind, self._settings.lighting)
         self._run(
