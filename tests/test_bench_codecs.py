@@ -97,8 +97,8 @@ def test_cells_hold_the_stored_points_on_their_grid(scene):
 
 def test_scenes_and_point_files_in_turn(scene, tmp_path):
     np.savetxt(tmp_path / "scatter.xyz", np.random.default_rng(1).uniform(0, 1, (500, 3)))
-    with scene_paths([str(scene), str(tmp_path)], 1, 100) as paths:
-        assert [name for name, _ in paths] == ["ball", "scatter"]
+    with scene_paths([str(scene), str(tmp_path), str(scene)], 1, 100) as paths:
+        assert [name for name, _ in paths] == ["ball", "scatter", "ball (2)"]
         assert load_cells(*paths[1], bits=8, most_cells=1000, leaves=True, size=64).n_stored == 500
         built = paths[1][1]
     assert scene.exists()

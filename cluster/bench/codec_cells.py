@@ -56,7 +56,7 @@ class CellScene:
 
 @contextmanager
 def scene_paths(inputs: Sequence[str], n_default: int, points_per_cell: int) -> Iterator[list[tuple[str, Path]]]:
-    """(name, scene directory) of each scene, and of each point file, built for as long as this is open.
+    """(name, scene directory) of each scene, and of each point file, built for as long as this is open. Names differ.
 
     n_default : points of the generated surface that stands in where there are no inputs.
     Raises InputError for what is neither.
@@ -77,7 +77,8 @@ def scene_paths(inputs: Sequence[str], n_default: int, points_per_cell: int) -> 
                 path = Path(folder) / f"{i}.scene"
                 build_scene([source], path, settings=BuildSettings(points_per_cell=points_per_cell))
                 source = path
-            scenes.append((name, source))
+            same = sum(taken.split(" (")[0] == name for taken, _ in scenes)
+            scenes.append((f"{name} ({same + 1})" if same else name, source))
         yield scenes
 
 

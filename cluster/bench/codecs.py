@@ -49,7 +49,7 @@ class Contestant:
     bound: Callable[[Cell], float] = lambda _: 0.0
     figures: Callable[[Sequence[np.ndarray]], dict[str, float]] = lambda _: {}
     text: str = "{bits_per_point:.1f} bits/point"
-    paper: str = "–"
+    paper: str = "none"
     frame: MakeFrame | None = None
 
 
@@ -330,48 +330,45 @@ def _foreground(draw: Draw) -> int:
 
 
 def print_codecs(results: dict[str, Any], console: Any) -> None:
-    """The result as a table, and what was measured."""
+    """A table for each scene, the figures beside those of the papers, and how they were measured."""
     from rich.table import Table
 
-    table = Table(
-        title=f"Positions on {results['bits']} bits an axis; medians of {results['repeats']}, fastest … slowest"
-    )
-    for heading in ("scene", "codec"):
-        table.add_column(heading, no_wrap=True)
-    for heading in ("bytes/point", "encode M/s", "decode M/s", "bound %", "error %", "RMS %", "frame ms"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    table.add_column("drawn from")
-    for row in results["rows"]:
-        rate, ms = row["points_per_s"], row["ms"].get("frame")
-        table.add_row(
-            row["scene"],
-            row["codec"],
-            f"{row['bytes_per_point']:.2f}",
-            *(f"{rate[what] / 1e6:.2f}" if what in rate else "–" for what in ("encode", "decode")),
-            *("–" if row[what] is None else f"{100 * row[what]:.2g}" for what in ("bound", "error", "rms")),
-            f"{ms['median']:.2f} ({ms['min']:.2f}…{ms['max']:.2f})" if ms else "–",
-            f"failed: {row['failed']}" if row["failed"] else row["drawn_from"],
-        )
-    console.print(table)
-    table = Table(title="Beside the papers")
-    for heading in ("scene", "codec", "ours", "paper"):
-        table.add_column(heading)
-    for row in results["rows"]:
-        if row["ours"] is not None:
-            table.add_row(row["scene"], row["codec"], row["ours"], row["paper"])
-    console.print(table)
     for scene in results["scenes"]:
-        console.print(
-            f"{scene['scene']}: {scene['cells']:,} of {scene['cells_in_scene']:,} cells, {scene['stored_points']:,} "
-            f"points, {scene['grid_points']:,} grid points"
+        rows = [row for row in results["rows"] if row["scene"] == scene["scene"]]
+        table = Table(
+            title=f"{scene['scene']}: {scene['cells']:,} of {scene['cells_in_scene']:,} cells, "
+            f"{scene['stored_points']:,} points, {scene['grid_points']:,} at {results['bits']} bits an axis"
         )
+        table.add_column("codec", no_wrap=True)
+        for heading in ("bytes/point", "encode M/s", "decode M/s", "bound %", "error %", "RMS %", "frame ms"):
+            table.add_column(heading, justify="right", no_wrap=True)
+        table.add_column("drawn from")
+        for row in rows:
+            table.add_row(*_measured(row))
+        console.print(table)
+        for row in rows:
+            if row["ours"] is not None:
+                console.print(f"{row['codec']}: {row['ours']}; paper: {row['paper']}")
     for item in results["omitted"]:
         console.print(f"{item['codec']}: left out, {item['reason']}")
     machine = results["machine"]
     console.print(
         f"M/s: million points a second on {results['threads']} threads. "
+        f"Medians of {results['repeats']}, of frames fastest … slowest. "
         f"bound, error (largest), RMS: from the stored position, of the scene's longest side. "
         f"ε = {100 * results['epsilon']:g} %. "
         f"Frames of {results['size_px']}² pixels hold all of these cells."
     )
     console.print(f"{machine['cpu']}, {machine['cores']} cores, commit {machine['commit'] or 'unknown'}")
+
+
+def _measured(row: dict[str, Any]) -> list[str]:
+    rate, ms = row["points_per_s"], row["ms"].get("frame")
+    return [
+        row["codec"],
+        f"{row['bytes_per_point']:.2f}",
+        *(f"{rate[what] / 1e6:.2f}" if what in rate else "–" for what in ("encode", "decode")),
+        *("–" if row[what] is None else f"{100 * row[what]:.2g}" for what in ("bound", "error", "rms")),
+        f"{ms['median']:.2f} ({ms['min']:.2f}…{ms['max']:.2f})" if ms else "–",
+        f"failed: {row['failed']}" if row["failed"] else row["drawn_from"],
+    ]
