@@ -23,7 +23,7 @@ from splatpipe.nodes.sampling import SamplingNode
 from splatpipe.shared.build import BuildSettings, build_scene
 from splatpipe.shared.camera import Camera, look_at, perspective_camera
 from splatpipe.shared.config import RunConfig
-from splatpipe.shared.errors import ConfigError, InputError, MessageError
+from splatpipe.shared.errors import ConfigError, DeviceError, InputError, MessageError
 from splatpipe.shared.messages import FRAMEBUFFER_EMPTY, RENDER_POINT, VisibilityBits
 from splatpipe.shared.octree import CORNER, FLAT
 from splatpipe.shared.octree import EDGE as EDGE_CELL
@@ -351,6 +351,12 @@ def test_lit_splats_are_not_shaded_twice(tmp_path):
         config = {"scene": {"path": str(tmp_path / "s.scene")}, "splats": {"lighting": lighting}}
         job = Job(RunConfig.model_validate(config | {"render": {"style": "splats"}}))
         assert job.colouring.mode == mode
+
+
+def test_the_bench_says_which_package_it_misses_before_it_draws(tmp_path, monkeypatch):
+    monkeypatch.setattr("splatpipe.shared.metrics.find_spec", lambda name: None)
+    with pytest.raises(DeviceError, match=r"install splatpipe\[error\]"):
+        bench_splats([tmp_path / "none.scene"])
 
 
 def test_edges_and_corners_are_sampled_more_densely(tmp_path):

@@ -22,7 +22,7 @@ from ...nodes.raster.splat import CpuSplatRasterizer, SplatCounts
 from ...shared.colour import frame_to_rgba
 from ...shared.config import RunConfig
 from ...shared.messages import FRAMEBUFFER_EMPTY
-from ...shared.metrics import flip, psnr_db, rmse
+from ...shared.metrics import check_installed, flip, psnr_db, rmse
 from ...shared.octree import FLAT
 from ..job import Job
 from ..record import machine_record, spread_ms
@@ -52,8 +52,10 @@ def bench_splats(
     repeats : timed frames of each view and way.  pictures : a folder for the first view of each scene: points, splats,
     feature-driven splats and their difference side by side.
 
-    Returns a JSON-able dict: ``rows``, one a scene, and the machine. Raises InputError, StoreError for a scene without.
+    Returns a JSON-able dict: ``rows``, one a scene, and the machine. Raises InputError, StoreError for a scene without,
+    DeviceError without the packages of splatpipe[error].
     """
+    check_installed()
     return {
         "benchmark": "splats",
         "size_px": size,
