@@ -18,9 +18,9 @@ def test_the_commands_for_ones_own_file_work_in_order(tmp_path):
     for seed in (1, 2):
         write_las(CityScan(n_points=20_000, seed=seed), tmp_path / "survey" / f"{seed}.laz")
     blocks = re.findall(r"```sh\n(.*?)```", README.partition("## Your own file")[2], re.DOTALL)
-    lines = [line.partition("  #")[0].strip() for block in blocks[:2] for line in block.splitlines()]
+    lines = [line.partition("  #")[0].strip() for block in blocks[:3] for line in block.splitlines()]
     commands = [line for line in lines if not line.startswith("pip ")]
-    assert len(commands) == 6
+    assert len(commands) == 8
     small = " --set output.frames=2 --set pipeline.topology=single"
     for line in commands:
         line += small * line.startswith("splatpipe run")
@@ -42,7 +42,21 @@ def test_files_and_pictures_it_links_to_are_there():
         assert (ROOT / script).exists(), script
 
 
-@pytest.mark.parametrize("command", ["synth", "build", "info", "verify", "run", "bench raster", "bench build"])
+@pytest.mark.parametrize(
+    "command",
+    [
+        "synth",
+        "build",
+        "info",
+        "verify",
+        "run",
+        "bench raster",
+        "bench build",
+        "bench lod",
+        "bench splats",
+        "bench pipeline",
+    ],
+)
 def test_every_command_has_help_with_an_example(command):
     done = subprocess.run(
         [sys.executable, "-m", "splatpipe.cluster", *command.split(), "--help"],
