@@ -58,7 +58,7 @@ def cell_spacing(scene: Scene, octree: Octree, cells: np.ndarray) -> np.ndarray:
     The distance to the ``NEIGHBOUR``-th nearest in a sample of the cell's own set, scaled by √(sampled / own) as on a
     surface. Too few points for that (outliers, and cells that a surface only grazes) are taken to lie as densely as
     the parent's on a surface that crosses its cube. It is the spacing of the whole set, also where only its head is
-    drawn: a cell of N pixels is cut only if that head covers them with two points a pixel or ⌊N ln N⌋.
+    drawn: a cell of N pixels is cut only if that head covers them (``nodes.sampling``).
     (The edge over the root of the number of points, which needs no point, is wrong by the share of the cube's face that
     the surface covers: outliers become as large as their cell.)
 

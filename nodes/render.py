@@ -1,4 +1,7 @@
-"""The render node: render-points array in, framebuffer out (thesis 5.2.1, node 3). It never sees the octree's cells."""
+"""The render node: render-points array in, framebuffer out (thesis 5.2.1, node 3).
+
+Frames need no cell of the octree; what goes by cell is made when points are loaded (``cell_blocks``).
+"""
 
 from __future__ import annotations
 
