@@ -112,14 +112,14 @@ class RenderSection(Section):
     class_colours: dict[str, str] = {}
     background: str = "#1e2127"
     supersampling: Annotated[int, Field(ge=1, le=8)] = 1
-    edl_strength: Annotated[float, Field(ge=0)] = 0.0
+    edl_strength: Annotated[float, Field(ge=0, le=1e6)] = 0.0
     edl_radius_px: Annotated[float, Field(ge=0.5, le=64)] = 1.5
 
 
 class SplatSection(Section):
     """``[splats]``: used where ``render.style`` is ``splats``."""
 
-    radius_scale: Positive = 1.0
+    radius_scale: Annotated[float, Field(gt=0, le=1e6)] = 1.0
     depth_offset: Annotated[float, Field(ge=0)] = 1.0
     features: bool = False
     lighting: bool = True

@@ -46,6 +46,8 @@ def test_paths_in_a_file_are_relative_to_it_and_on_the_command_line_to_where_one
         ("[sampling]\npixel_threshold = -4", [], "sampling.pixel_threshold = -4, expected greater than or equal to 0"),
         ("[sampling]\npixel_threshold = nan", [], "sampling.pixel_threshold = nan"),
         ("[render]\nthreads = 'two'", [], "render.threads = 'two', expected a valid integer"),
+        ("[render]\nedl_strength = 1e300", [], "render.edl_strength = 1e+300, expected less than or equal to 1000000"),
+        ("[splats]\nradius_scale = 1e300", [], "splats.radius_scale = 1e+300, expected less than or equal to 1000000"),
         (
             "[render]\nrasterizer = 'vulkan'",
             [],
