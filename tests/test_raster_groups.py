@@ -8,9 +8,10 @@ from splatpipe.nodes.raster import PointSize, ResidentPoints
 from splatpipe.nodes.raster.blocks import frustum
 from splatpipe.nodes.raster.groups import INSIDE_PX, NOT_INSIDE, OUTSIDE, draw_groups, group_cells, outcodes
 from splatpipe.nodes.raster.groups_reference import project_groups
-from splatpipe.nodes.raster.kernels import RUN, View, pitch_of
+from splatpipe.nodes.raster.kernels import BATCH, RUN, View, pitch_of
 from splatpipe.nodes.raster.reference import reference_frame
 from splatpipe.shared.camera import look_at, perspective_camera
+from splatpipe.shared.codecs.group_search import MOST_IN_PART
 from splatpipe.shared.codecs.linear_groups import LinearGroupCodec
 from splatpipe.shared.errors import CodecError
 from splatpipe.shared.messages import FRAMEBUFFER_EMPTY, RENDER_POINT
@@ -139,7 +140,8 @@ def test_runs_hold_as_many_partitions_as_fit():
     _, groups = scene(n=9000)
     sizes = np.diff(groups.first_kept)
     assert sizes.sum() == len(groups.x)
-    assert sizes.max() <= 1024
+    assert sizes.max() <= BATCH
+    assert MOST_IN_PART <= BATCH
     assert (sizes > 900).sum() >= len(sizes) - 2
 
 
@@ -163,7 +165,7 @@ def test_clipping_is_conservative(ends, one_pixel, projected):
         x, y = x * w, y * w
     near, columns, rows, smallest, largest = map(np.float32, (0.5, WIDTH, HEIGHT, 1, side))
     view = View(near, columns, rows, smallest, largest, np.int32(pitch_of(WIDTH)), one_pixel)
-    code = np.empty(2, np.uint16)
+    code = np.empty(2, np.uint32)
     outcodes(x, y, w, 2, view, code)
     for number in (np.float64, np.float32):
         t = np.arange(256).astype(number) * number(1 / 256)
@@ -185,7 +187,7 @@ def test_most_segments_need_no_look_at_their_points():
     w = rng.uniform(1, 2, 4000).astype(np.float32)
     x, y = (rng.uniform(-side, 2 * side, 4000).astype(np.float32) * w for side in (WIDTH, HEIGHT))
     view = View(*map(np.float32, (0.5, WIDTH, HEIGHT, 1, 1)), np.int32(pitch_of(WIDTH)), True)
-    code = np.empty(4000, np.uint16)
+    code = np.empty(4000, np.uint32)
     outcodes(x, y, w, 4000, view, code)
     inside = (x / w >= 0) & (x / w < WIDTH) & (y / w >= 0) & (y / w < HEIGHT)
     assert ((code & NOT_INSIDE == 0) & ~inside).sum() == 0

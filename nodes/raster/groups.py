@@ -36,8 +36,8 @@ INSIDE_PX = 1 / 64
 """An accepted group's ends are this far inside the image; interpolating rounds by at most a quarter of it, in an image
 of 32768 pixels."""
 
-OUTSIDE, NOT_INSIDE = np.uint16(0b11111), np.uint16(0b11111 << 5)
-"""Bits of outcodes: beyond the near plane, left, right, top, bottom side; not certainly within it."""
+OUTSIDE, NOT_INSIDE = np.uint32(0b11111), np.uint32(0b100000)
+"""Bits of outcodes: beyond the near plane, left, right, top, bottom side; not certainly within all of them."""
 
 _BELOW, _ABOVE = np.float32(1 - 2.0**-20), np.float32(1 + 2.0**-20)
 _INSIDE = np.float32(INSIDE_PX)
@@ -181,7 +181,7 @@ def draw_groups(groups, cells, frustum, view, words, dirty, turn, counter):
         floats[0],
         floats[1],
         floats[2],
-        np.empty(BATCH, np.uint16),
+        np.empty(BATCH, np.uint32),
         floats[3],
         floats[4],
         floats[5],
@@ -210,11 +210,11 @@ def _draw_run(groups, run, rows, side_at_one, view, words, dirty, scratch):
     x, y, w, colour = scratch.x, scratch.y, scratch.w, scratch.colour
     _transform(groups.x, groups.y, groups.z, first, count, rows, kept_x, kept_y, kept_w)
     any_code, common_code = outcodes(kept_x, kept_y, kept_w, count, view, code)
-    if common_code & OUTSIDE:
+    if common_code:
         return
     _take(kept_x, kept_y, kept_w, count, groups.kept_colour, first, any_code, side_at_one, view, words, dirty, scratch)
     gaps = any_code & OUTSIDE != 0  # some groups may be rejected: colours of the others are put together
-    n, q, any_code = 0, groups.first_inner[run], np.uint16(0)
+    n, q, any_code = 0, groups.first_inner[run], np.uint32(0)
     for g in range(groups.first_group[run], groups.first_group[run + 1]):
         a, b, m = np.uintp(groups.v1[g]), np.uintp(groups.v2[g]), np.int64(groups.n_inner[g])
         if code[a] & code[b] & OUTSIDE:
@@ -223,7 +223,7 @@ def _draw_run(groups, run, rows, side_at_one, view, words, dirty, scratch):
         if n + m > BATCH:
             colours, first = (colour, 0) if gaps else (groups.inner_colour, q - n)
             _take(x, y, w, n, colours, first, any_code, side_at_one, view, words, dirty, scratch)
-            n, any_code = 0, np.uint16(0)
+            n, any_code = 0, np.uint32(0)
         any_code |= code[a] | code[b]
         dx, dy, dw = kept_x[b] - kept_x[a], kept_y[b] - kept_y[a], kept_w[b] - kept_w[a]
         for i in range(m):
@@ -257,21 +257,21 @@ def outcodes(x, y, w, n, view, code):
     A segment is rejected where its ends share a bit of ``OUTSIDE``, accepted where neither has one of ``NOT_INSIDE``. A
     value that is not a number is neither beyond a side nor within it.
     """
-    any_code, common_code = np.uint16(0), np.uint16(0xFFFF)
-    margin = view.largest
+    margin, below, above = view.largest, view.near * _BELOW, view.near * _ABOVE
+    right, bottom = view.width + margin, view.height + margin
+    inner_right, inner_bottom = view.width - _INSIDE, view.height - _INSIDE
     for i in range(n):
         a, b, c = x[i], y[i], w[i]
-        beyond = np.uint16(c < view.near * _BELOW)
-        beyond |= np.uint16(a < -margin * c) << np.uint16(1)
-        beyond |= np.uint16(a > (view.width + margin) * c) << np.uint16(2)
-        beyond |= np.uint16(b < -margin * c) << np.uint16(3)
-        beyond |= np.uint16(b > (view.height + margin) * c) << np.uint16(4)
-        within = np.uint16((c >= view.near * _ABOVE) & (c <= _FAR))
-        within |= np.uint16(a >= _INSIDE * c) << np.uint16(1)
-        within |= np.uint16(a <= (view.width - _INSIDE) * c) << np.uint16(2)
-        within |= np.uint16(b >= _INSIDE * c) << np.uint16(3)
-        within |= np.uint16(b <= (view.height - _INSIDE) * c) << np.uint16(4)
-        code[i] = beyond | (within << np.uint16(5)) ^ NOT_INSIDE
+        bits = np.uint32(1) if c < below else np.uint32(0)
+        bits |= np.uint32(2) if a < -margin * c else np.uint32(0)
+        bits |= np.uint32(4) if a > right * c else np.uint32(0)
+        bits |= np.uint32(8) if b < -margin * c else np.uint32(0)
+        bits |= np.uint32(16) if b > bottom * c else np.uint32(0)
+        inside = (c >= above) & (c <= _FAR)
+        inside &= (a >= _INSIDE * c) & (a <= inner_right * c) & (b >= _INSIDE * c) & (b <= inner_bottom * c)
+        code[i] = bits if inside else bits | NOT_INSIDE
+    any_code, common_code = np.uint32(0), OUTSIDE
+    for i in range(n):
         any_code |= code[i]
         common_code &= code[i]
     return any_code, common_code
