@@ -32,8 +32,8 @@ class Octree:
     first_child : (n,) int32, −1 for a leaf.  n_children : (n,) uint8, 0…8.
     first_point, n_points : (n,) int64, the cell's contiguous range in the point-array.
     n_below : (n,) int64, input points inside the cell's cube.
-    area : (n,) float32 or None, surface inside the cell in faces of its cube, estimated; None where sets stand in random
-        order and not in stratified order (``build.sets``).
+    area : (n,) float32 or None, surface inside the cell in faces of its cube, estimated; None where sets stand in
+        random order and not in stratified order (``build.sets``).
     cone : (n, 4) float32 or None: unit axis and cosine of the half angle of a cone that holds every normal below the
         cell; a cosine of −1 means "any direction".
     feature : (n,) uint8 or None: what the points of the cell's own range look like (thesis 4.3.1), a code of

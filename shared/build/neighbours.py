@@ -78,7 +78,7 @@ def add_surface(
     reach, around = np.full(n + 1, np.nan), np.empty((n, k) if rule.radii else (0, k), np.int32)
 
     def search(begin: int, end: int) -> None:
-        distance, neighbour = map(np.asarray, tree.query(positions[begin:end], k=np.arange(1, k + 1)))
+        distance, neighbour = (np.reshape(a, (-1, k)) for a in tree.query(positions[begin:end], k=k))
         if rule.normals:
             normal[begin:end] = pack_normals(plane_normals(positions, neighbour, rule.up is None, toward))
         if rule.radii:
