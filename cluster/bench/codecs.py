@@ -200,7 +200,7 @@ def _contestants(scene: CellScene, bits: int, epsilon: float) -> tuple[list[Cont
 
 def _draco(bits: int) -> Contestant:
     """Draco's k-d tree on the same grid points. Raises ImportError where it is not installed."""
-    import DracoPy
+    import DracoPy  # pyright: ignore[reportMissingImports]
 
     def encode(cell: Cell) -> Encoded:
         data = DracoPy.encode(
