@@ -22,6 +22,7 @@ from ..shared.errors import ConfigError
 from ..shared.octree import FEATURES, Octree
 from ..shared.store import Scene
 from .raster import CellFeatures
+from .raster.threads import read_only
 
 Corner = tuple[float, float, float]
 
@@ -111,7 +112,7 @@ class PointFilter:
         keep_inside = np.array([box.keep_inside for box in self.boxes], bool)
         out = np.empty(len(x), np.float32)
         ends = np.append(first[1:], len(x))
-        x, y, z, codes = map(_read_only, (x, y, z, codes))
+        x, y, z, codes = map(read_only, (x, y, z, codes))
         _filter(x, y, z, codes, keep_class, first, ends, origin, corners, keep_inside, out)
         return out
 
@@ -123,13 +124,6 @@ def features_left(features: CellFeatures, x: np.ndarray) -> CellFeatures:
     """
     lost = np.logical_or.reduceat(np.isnan(x), features.first_point)
     return replace(features, feature=np.where(lost, np.uint8(FEATURES.index("none")), features.feature))
-
-
-def _read_only(column: np.ndarray) -> np.ndarray:
-    """A read-only view, so that mapped and fresh arrays are one type to the compiler."""
-    view = np.ascontiguousarray(column).view()
-    view.flags.writeable = False
-    return view
 
 
 @njit(nogil=True, cache=True)

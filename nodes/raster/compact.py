@@ -19,8 +19,9 @@ import numpy as np
 from numba import njit
 
 from . import ResidentPoints
+from .atomic import fetch_add
 from .blocks import BITS
-from .kernels import FILTERED, _fetch_add
+from .kernels import FILTERED
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ def compact_positions(points: ResidentPoints, threads: int) -> CompactPositions:
 @njit(nogil=True, cache=True)
 def _encode(x, y, z, first, high, low, lower, step, counter):
     """Encode blocks until none is left; ``reference.fixed_point_bins`` is the readable twin."""
-    b = _fetch_add(counter, 1)
+    b = fetch_add(counter, 1)
     while b < len(first) - 1:
         begin, end = first[b], first[b + 1]
         if begin < end:
@@ -79,7 +80,7 @@ def _encode(x, y, z, first, high, low, lower, step, counter):
             bz = _bin(z[i], lower[b, 2], step[b, 2])
             high[i] = (bx >> 10) | (by >> 10) << 10 | (bz >> 10) << 20
             low[i] = (bx & 1023) | (by & 1023) << 10 | (bz & 1023) << 20
-        b = _fetch_add(counter, 1)
+        b = fetch_add(counter, 1)
 
 
 @njit(nogil=True, cache=True)

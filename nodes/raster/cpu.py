@@ -8,20 +8,17 @@ picture does not depend on the number of threads or on which thread drew what.
 from __future__ import annotations
 
 import math
-import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ...shared.camera import Camera
-from ...shared.errors import InputError
 from ...shared.messages import FRAMEBUFFER_EMPTY
-from . import MAX_SIDE_PX, PointSize, ResidentPoints, check_viewport, kernels, world_sides
+from . import PointSize, ResidentPoints, check_viewport, kernels, world_sides
 from .blocks import Blocks, frustum
 from .pieces import split_entries
+from .threads import ThreadedRasterizer, read_only
 
 PIECE_POINTS = 1 << 14
 """Most points of a piece, the unit of work that threads take in turn."""
@@ -33,7 +30,7 @@ MERGED_PIXELS_PER_POINT = 2.5
 """Words of one framebuffer that are merged in the time of drawing a point: measured 2 at 1024² … 6 at 4096²."""
 
 
-class CpuRasterizer:
+class CpuRasterizer(ThreadedRasterizer):
     """Draws a resident point-array on the CPU; a context manager that owns its threads and framebuffers.
 
     points : the render rank's half of a scene. Not modified, not copied if its arrays have the documented dtypes.
@@ -59,12 +56,7 @@ class CpuRasterizer:
         *,
         compact: bool = False,
     ) -> None:
-        if not (1 <= width <= MAX_SIDE_PX and 1 <= height <= MAX_SIDE_PX):
-            raise InputError(f"viewport: found {width}×{height}, expected 1…{MAX_SIDE_PX} px a side")
-        self._threads = len(os.sched_getaffinity(0)) if threads is None else threads
-        if self._threads < 1:
-            raise InputError(f"threads: found {threads}, expected at least 1")
-        self.device = f"{self._threads} CPU thread" + "s" * (self._threads > 1)
+        super().__init__(width, height, threads)
         self._sides = size.pixels, max(size.pixels, size.maximum) if size.world or size.adaptive else size.pixels
         self._n_points = len(points)
         self._block_first_point = np.asarray(points.block_first_point, np.int64)
@@ -82,7 +74,7 @@ class CpuRasterizer:
         columns["colour"] = points.colour
         filtered = bool(columns["high"].max(initial=0) >= kernels.FILTERED)
         self._points = kernels.Points(
-            **{name: _read_only(column) for name, column in columns.items()}, filtered=filtered
+            **{name: read_only(column) for name, column in columns.items()}, filtered=filtered
         )
         self._blocks = Blocks(
             np.ascontiguousarray(points.block_origin, np.float64), world_sides(points, size), lower, step
@@ -95,7 +87,6 @@ class CpuRasterizer:
         self._n_clean = 0
         self._frame = np.empty((height, width), np.uint64)
         self._filled = np.ones(n_runs, np.uint8)
-        self._executor = ThreadPoolExecutor(self._threads, "raster")
 
     def draw(self, camera: Camera, entries: np.ndarray) -> np.ndarray:
         """(height, width) uint64 framebuffer words, row 0 on top; valid until the next call.
@@ -113,15 +104,15 @@ class CpuRasterizer:
         self._n_clean, n_clean = 0, max(self._n_clean, len(framebuffers))  # none, until the frame is complete
         counter = np.zeros(1, np.int64)
         self._run(
-            len(framebuffers),
             lambda i: kernels.draw(
                 self._points, self._blocks, pieces, seen, view, framebuffers[i], dirty[i], turn, counter
             ),
+            len(framebuffers),
         )
         counter = np.zeros(1, np.int64)
         self._run(
-            min(self._threads, height),
             lambda _: kernels.merge(framebuffers, dirty, self._frame, self._filled, counter),
+            min(self._threads, height),
         )
         self._n_clean = n_clean
         return self._frame
@@ -142,21 +133,6 @@ class CpuRasterizer:
             self._filled[:] = 1  # whatever a frame that failed left in the picture
         return self._framebuffers[:n]
 
-    def _run(self, n: int, work: Callable[[int], None]) -> None:
-        """Call ``work(0)`` … ``work(n − 1)``, each on its own thread."""
-        for _ in self._executor.map(work, range(n)):
-            pass
-
-    def close(self) -> None:
-        """End the threads."""
-        self._executor.shutdown()
-
-    def __enter__(self) -> CpuRasterizer:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
 
 def framebuffers_worth(n_points: int, threads: int, n_pixels: int) -> int:
     """How many framebuffers make a frame shortest, 1 … ``threads``.
@@ -165,16 +141,6 @@ def framebuffers_worth(n_points: int, threads: int, n_pixels: int) -> int:
     """
     best = math.sqrt(MERGED_PIXELS_PER_POINT * n_points * threads / n_pixels)
     return min(max(round(best), 1), threads)
-
-
-def _read_only(column: np.ndarray) -> np.ndarray:
-    """A read-only view, so that memory-mapped and fresh arrays are one type to the compiler.
-
-    A column of one repeated value (stride 0) stays one value in memory; the kernels are compiled for it apart.
-    """
-    view = column.view() if column.strides == (0,) else np.ascontiguousarray(column).view()
-    view.flags.writeable = False
-    return view
 
 
 def kernels_cached() -> bool:

@@ -29,7 +29,8 @@ from ...shared.codecs.group_search import STEPS
 from ...shared.codecs.linear_groups import LinearGroups
 from ...shared.codecs.order import gather_runs
 from ...shared.errors import CodecError
-from .kernels import BATCH, _fetch_add, _pack, _project, _take_pixels, _take_squares
+from .atomic import fetch_add
+from .kernels import BATCH, _pack, _project, _take_pixels, _take_squares
 from .pools import _cell_rows
 
 INSIDE_PX = 1 / 64
@@ -191,7 +192,7 @@ def draw_groups(groups, cells, frustum, view, words, dirty, turn, counter):
         np.empty(BATCH, np.uint64),
     )
     rows = np.empty((3, 4), np.float32)
-    begin = _fetch_add(counter, turn)
+    begin = fetch_add(counter, turn)
     while begin < len(cells):
         for k in range(begin, min(begin + turn, len(cells))):
             c = cells[k]
@@ -199,7 +200,7 @@ def draw_groups(groups, cells, frustum, view, words, dirty, turn, counter):
             side_at_one = np.float32(groups.world_side[c] * frustum.focal_px)
             for run in range(groups.first_run[c], groups.first_run[c + 1]):
                 _draw_run(groups, run, rows, side_at_one, view, words, dirty, scratch)
-        begin = _fetch_add(counter, turn)
+        begin = fetch_add(counter, turn)
 
 
 @njit(nogil=True, cache=True)

@@ -26,6 +26,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from ...shared.messages import FRAMEBUFFER_EMPTY
+from .atomic import fetch_add
 from .blocks import BITS, FLOAT32, FULL, HIGH, OUTSIDE
 
 BATCH = 1024
@@ -91,19 +92,6 @@ def pitch_of(width: int) -> int:
     return (-(-width // RUN) | 1) * RUN
 
 
-def _fetch_add_intrinsic(_context: Any, counter: Any, amount: Any) -> Any:
-    """Atomically add ``amount`` to ``counter[0]`` ((1,) int64) and return what it was."""
-
-    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        array = cgutils.create_struct_proxy(signature.args[0])(context, builder, arguments[0])
-        return builder.atomic_rmw("add", array.data, arguments[1], "monotonic")
-
-    return types.int64(counter, types.int64), codegen
-
-
-_fetch_add: Any = intrinsic(_fetch_add_intrinsic)
-
-
 def _prefetch_intrinsic(_context: Any, column: Any, index: Any) -> Any:
     """Ask for the cache line of ``column[index]``, which may lie beyond the end."""
 
@@ -137,7 +125,7 @@ def draw(points, blocks, pieces, frustum, view, words, dirty, turn, counter):
     high, low = np.empty(BATCH, np.uint32), np.empty(BATCH, np.uint32)
     colour = np.empty(BATCH, np.uint32)
     rows = np.empty((3, 4), np.float32)
-    begin = _fetch_add(counter, turn)
+    begin = fetch_add(counter, turn)
     while begin < len(pieces):
         for k in range(begin, min(begin + turn, len(pieces))):
             s, stride = np.uintp(pieces[k].segment), np.int64(pieces[k].stride)
@@ -175,7 +163,7 @@ def draw(points, blocks, pieces, frustum, view, words, dirty, turn, counter):
                     _take_pixels(place, packed, n, words, dirty)
                 else:
                     _take_squares(place, packed, n, view, words, dirty)
-        begin = _fetch_add(counter, turn)
+        begin = fetch_add(counter, turn)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -414,7 +402,7 @@ def merge(framebuffers, dirty, frame, filled, counter):
     """
     height, width = frame.shape
     pitch = (framebuffers.shape[1] - 1) // height
-    row = _fetch_add(counter, 1)
+    row = fetch_add(counter, 1)
     while row < height:
         for begin in range(0, width, RUN):
             end = min(begin + RUN, width)
@@ -432,4 +420,4 @@ def merge(framebuffers, dirty, frame, filled, counter):
                 for c in range(begin, end):
                     frame[row, c] = _EMPTY
             filled[run] = drawn
-        row = _fetch_add(counter, 1)
+        row = fetch_add(counter, 1)

@@ -28,7 +28,8 @@ from numba.extending import intrinsic
 
 from ...shared.codecs.pools import TAG_BITS
 from ...shared.codecs.streams import MOST_TRANSLATIONS, PooledPoints
-from .kernels import BATCH, _fetch_add, _pack, _project, _take_pixels, _take_squares
+from .atomic import fetch_add
+from .kernels import BATCH, _pack, _project, _take_pixels, _take_squares
 
 ROUNDING = 2.0**-20
 """Of the image's longer side, by which a point may lie beside its place."""
@@ -175,7 +176,7 @@ def draw_pools(pools, cells, frustum, view, words, dirty, turn, counter):
         np.zeros((3, MOST_TRANSLATIONS + TAG_BITS), np.float32),
     )
     rows = np.empty((3, 4), np.float32)
-    begin = _fetch_add(counter, turn)
+    begin = fetch_add(counter, turn)
     while begin < len(cells):
         for k in range(begin, min(begin + turn, len(cells))):
             c = cells[k]
@@ -183,7 +184,7 @@ def draw_pools(pools, cells, frustum, view, words, dirty, turn, counter):
             side_at_one = np.float32(pools.world_side[c] * frustum.focal_px)
             _draw_pools_of(pools, c, rows, side_at_one, view, words, dirty, batch)
             _draw_loose(pools, c, rows, side_at_one, view, words, dirty, batch)
-        begin = _fetch_add(counter, turn)
+        begin = fetch_add(counter, turn)
 
 
 @njit(nogil=True, cache=True)

@@ -6,21 +6,18 @@ normalisation one after the other in a buffer of its own, so the passes never me
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from time import perf_counter
 
 import numpy as np
 
 from ...shared.camera import Camera
-from ...shared.errors import InputError
 from ...shared.points import radius_table
-from . import MAX_SIDE_PX, CellFeatures, ResidentPoints, SplatSettings, check_viewport
-from .cpu import _read_only
+from . import CellFeatures, ResidentPoints, SplatSettings, check_viewport
 from .pieces import split_entries
 from .splat_geometry import MAX_SPLAT_PX, EyeFrame, drawn_cells, flat_cells, splat_columns
+from .threads import ThreadedRasterizer, read_only
 
 PIECE_POINTS = 1 << 14
 """Most points of a piece."""
@@ -48,7 +45,7 @@ class SplatCounts:
     tiles_s: float = 0.0
 
 
-class CpuSplatRasterizer:
+class CpuSplatRasterizer(ThreadedRasterizer):
     """Draws a resident point-array as splats on the CPU; a context manager that owns its threads and buffers.
 
     points : the render rank's half of a scene, with normals and radii. Not modified, not copied if its arrays have the
@@ -70,16 +67,11 @@ class CpuSplatRasterizer:
     ) -> None:
         from . import splat_project, splat_quads, splat_tiles
 
-        if not (1 <= width <= MAX_SIDE_PX and 1 <= height <= MAX_SIDE_PX):
-            raise InputError(f"viewport: found {width}×{height}, expected 1…{MAX_SIDE_PX} px a side")
-        self._threads = len(os.sched_getaffinity(0)) if threads is None else threads
-        if self._threads < 1:
-            raise InputError(f"threads: found {threads}, expected at least 1")
-        self.device = f"{self._threads} CPU thread" + "s" * (self._threads > 1)
+        super().__init__(width, height, threads)
         self.counts = SplatCounts()
         normal, radius = splat_columns(points)
         columns = (points.x, points.y, points.z, points.colour, normal, radius)
-        self._columns = tuple(map(_read_only, columns))
+        self._columns = tuple(map(read_only, columns))
         self._settings = settings
         self._radii = (radius_table(points.root_edge) * settings.radius_scale).astype(np.float32)
         self._block_first_point = np.asarray(points.block_first_point, np.int64)
@@ -93,7 +85,6 @@ class CpuSplatRasterizer:
         self._quads = _Listed(splat_quads.QUAD, splat_project.BOUNDS, self._n_across * n_down)
         self._planes = np.empty((self._threads, splat_tiles.PLANES * splat_tiles.TILE**2), np.float32)
         self._frame = np.empty((height, width), np.uint64)
-        self._executor = ThreadPoolExecutor(self._threads, "raster")
 
     def draw(self, camera: Camera, entries: np.ndarray) -> np.ndarray:
         """(height, width) uint64 framebuffer words, row 0 on top; valid until the next call.
@@ -170,21 +161,6 @@ class CpuSplatRasterizer:
             lambda _: project_quads(*planes, chunks, camera.eye, frame.rotation, pinhole, view, out, totals, counter)
         )
         return totals
-
-    def _run(self, work: Callable[[int], None]) -> None:
-        """Call ``work(thread)`` on every thread."""
-        for _ in self._executor.map(work, range(self._threads)):
-            pass
-
-    def close(self) -> None:
-        """End the threads."""
-        self._executor.shutdown()
-
-    def __enter__(self) -> CpuSplatRasterizer:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 class _Listed:

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 
 from ...shared.points import NO_NORMAL
-from .kernels import _fetch_add
+from .atomic import fetch_add
 from .splat_geometry import AMBIENT, LIGHT, MAX_SPLAT_PX, SCREEN_RADIUS_PX, SHININESS
 
 SPLAT = np.dtype(
@@ -71,7 +71,7 @@ def project(points, flat, pieces, chunks, rows, rotation, pinhole, view, radii, 
     splats, bounds = out
     scratch = np.empty(_N_COLUMNS * BATCH, np.float32)
     words, normals, visible = np.empty(BATCH, np.uint32), np.empty(BATCH, np.uint32), np.empty(BATCH, np.uint8)
-    chunk = _fetch_add(counter, 1)
+    chunk = fetch_add(counter, 1)
     while chunk < len(chunks) - 1:
         place, n, n_visible = chunks[chunk, 1], 0, 0
         for k in range(chunks[chunk, 0], chunks[chunk + 1, 0]):
@@ -96,7 +96,7 @@ def project(points, flat, pieces, chunks, rows, rotation, pinhole, view, radii, 
         written, seen = _write(scratch, visible, n, behind, splats, bounds, place)
         totals[chunk, 0] = place + written - chunks[chunk, 1]
         totals[chunk, 1] = n_visible + seen
-        chunk = _fetch_add(counter, 1)
+        chunk = fetch_add(counter, 1)
 
 
 @njit(nogil=True, cache=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from .kernels import _fetch_add
+from .atomic import fetch_add
 
 QUAD = np.dtype([(name, "<f8") for name in ("z0", "zx", "zy", "a0", "ax", "ay", "b0", "bx", "by")])
 """At the pixel centre (x, y) the plane has the inverse depth z = z0 + zx · x + zy · y; the rectangle covers it if
@@ -29,7 +29,7 @@ def project_quads(center, axes, drawn, chunks, eye, rotation, pinhole, view, out
     """
     quads, bounds = out
     p, a, b = np.empty(3), np.empty(3), np.empty(3)
-    chunk = _fetch_add(counter, 1)
+    chunk = fetch_add(counter, 1)
     while chunk < len(totals):
         place = chunks[chunk, 1]
         for i in range(chunks[chunk, 1], chunks[chunk + 1, 1]):
@@ -47,7 +47,7 @@ def project_quads(center, axes, drawn, chunks, eye, rotation, pinhole, view, out
                 _plane(p, a, b, pinhole, quads[place])
                 place += 1
         totals[chunk, 0] = place - chunks[chunk, 1]
-        chunk = _fetch_add(counter, 1)
+        chunk = fetch_add(counter, 1)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")

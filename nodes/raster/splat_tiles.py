@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 
 from ...shared.messages import FRAMEBUFFER_EMPTY
-from .kernels import _fetch_add
+from .atomic import fetch_add
 from .splat_geometry import MAX_SPLAT_PX, SCREEN_RADIUS_PX
 
 TILE = 64
@@ -49,7 +49,7 @@ _W0, _W1, _W2, _W3, _W4, _W5 = (np.float32(c) for c in WEIGHT)
 @njit(nogil=True, cache=True)
 def count_tiles(bounds, chunks, totals, n_across, counts, counter):
     """Fill (c, tiles) int64 ``counts``: how many splats of each chunk reach into each tile; others as ``project``."""
-    chunk = _fetch_add(counter, 1)
+    chunk = fetch_add(counter, 1)
     while chunk < len(counts):
         for tile in range(counts.shape[1]):
             counts[chunk, tile] = 0
@@ -58,7 +58,7 @@ def count_tiles(bounds, chunks, totals, n_across, counts, counter):
             for row in range(b.top // TILE, (b.bottom - 1) // TILE + 1):
                 for column in range(b.left // TILE, (b.right - 1) // TILE + 1):
                     counts[chunk, np.uintp(row * n_across + column)] += 1
-        chunk = _fetch_add(counter, 1)
+        chunk = fetch_add(counter, 1)
 
 
 @njit(nogil=True, cache=True)
@@ -75,7 +75,7 @@ def place_lists(places, first):
 @njit(nogil=True, cache=True)
 def fill_lists(bounds, chunks, totals, n_across, places, lists, counter):
     """Write the index of each splat into the list of each tile it reaches; ``places`` move on."""
-    chunk = _fetch_add(counter, 1)
+    chunk = fetch_add(counter, 1)
     while chunk < len(places):
         for i in range(chunks[chunk, 1], chunks[chunk, 1] + totals[chunk, 0]):
             b = bounds[i]
@@ -84,7 +84,7 @@ def fill_lists(bounds, chunks, totals, n_across, places, lists, counter):
                     tile = np.uintp(row * n_across + column)
                     lists[np.uintp(places[chunk, tile])] = i
                     places[chunk, tile] += 1
-        chunk = _fetch_add(counter, 1)
+        chunk = fetch_add(counter, 1)
 
 
 @njit(nogil=True, cache=True)
@@ -98,7 +98,7 @@ def draw_tiles(splats, quads, near, n_across, lanes, planes, frame, counter):
     records, bounds, lists, first = splats
     farthest = np.empty(_BLOCKS * _BLOCKS, np.float32)
     quad_records, quad_bounds, quad_lists, quad_first = quads
-    tile = _fetch_add(counter, 1)
+    tile = fetch_add(counter, 1)
     while tile < len(first) - 1:
         left, top = tile % n_across * TILE, tile // n_across * TILE
         begin, end = first[tile], first[tile + 1]
@@ -115,7 +115,7 @@ def draw_tiles(splats, quads, near, n_across, lanes, planes, frame, counter):
                 _see(records, bounds, lists, begin, end, left, top, near, lanes, planes, farthest, True)
                 _add(records, bounds, lists, begin, end, left, top, near, lanes, planes, farthest)
         _normalise(planes, begin == end, left, top, frame)
-        tile = _fetch_add(counter, 1)
+        tile = fetch_add(counter, 1)
 
 
 @njit(nogil=True, cache=True)
