@@ -184,7 +184,5 @@ def _tell(summary: dict[str, Any]) -> None:
     for path in summary["output"]:
         console.print(f"  wrote {path}")
     if summary["left_out"]:
-        console.print("left out, because this run does not need it:")
-    for item in summary["left_out"]:
-        saved = "" if item["gain"] is None else f" ({item['gain']:.3g} {item['unit']})"
-        console.print(f"  {item['what']}: {item['why']}{saved}")
+        names = ", ".join(item["what"] for item in summary["left_out"])
+        console.print(f"left out, because this run does not need it (why: run.json, splatpipe plan): {names}")
