@@ -142,7 +142,11 @@ class _terminated_with_us:
 
 
 class _Relay:
-    """Reads what the ranks print until they have ended, and finds out who ended first when one died."""
+    """Reads what the ranks print until they have ended, and finds out who ended first when one died.
+
+    The kernel says that a process has ended when its last thread has; ``mpiexec`` ends the other ranks as soon as it
+    loses one. A rank that is slow to go can therefore, seldom, be overtaken by one that was ended for its sake.
+    """
 
     def __init__(self, process: subprocess.Popen[str], on_record: Callable[[dict[str, Any]], None]) -> None:
         self._process = process
