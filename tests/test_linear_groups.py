@@ -1,7 +1,5 @@
 """Linear groups: construction against the paper's recursion, ε, bytes, maps."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -11,8 +9,6 @@ from splatpipe.shared.codecs.group_search import STEPS, group_partitions, partit
 from splatpipe.shared.codecs.linear_groups import LinearGroupCodec, read, write
 from splatpipe.shared.codecs.occupancy_kernels import morton_keys
 from splatpipe.shared.errors import CodecError
-
-MODELS = Path("/work/shared/data/models")
 
 
 @st.composite
@@ -206,12 +202,11 @@ def test_projective_maps_are_divided_point_by_point():
     assert w.max() / w.min() > 20
 
 
-@pytest.mark.skipif(not MODELS.exists(), reason="the real scans of shared/data are not here")
-def test_more_than_half_of_the_points_of_a_scan_go():
+def test_more_than_half_of_the_points_of_a_scan_go(data_dir):
     """The paper's figure: 55 % at ε = 0.5 % of the object."""
     from plyfile import PlyData
 
-    vertex = PlyData.read(MODELS / "stanford-bunny_35947.ply")["vertex"]
+    vertex = PlyData.read(data_dir / "models" / "stanford-bunny_35947.ply")["vertex"]
     positions = np.column_stack([vertex[axis] for axis in "xyz"]).astype(np.float64)
     positions -= positions.min(axis=0)
     points = np.minimum(positions / positions.max() * 2**16, 2**16 - 1).astype(np.int64)
