@@ -74,6 +74,15 @@ def build(
     features: Annotated[
         bool, typer.Option("--features", help="Store which cells are flat, edges or corners; --splats with it.")
     ] = False,
+    positions: Annotated[
+        str, typer.Option(help="Store positions as float32, or coded: ci, eci, occupancy or groups (lossy).")
+    ] = "float32",
+    position_bits: Annotated[int, typer.Option(help="Coded: bits an axis of the grid in each cell.")] = 12,
+    group_epsilon: Annotated[
+        float, typer.Option(help="groups: largest error, as a share of the scene's size.")
+    ] = 0.005,
+    pools: Annotated[bool, typer.Option("--pools", help="Store dense cells as transformation streams, too.")] = False,
+    pool_bits: Annotated[int, typer.Option(help="Pools: bits an axis, up to 8; 0: as suits --points-per-cell.")] = 0,
     strict: Annotated[bool, typer.Option(help="Refuse points that are not finite instead of dropping them.")] = False,
     overwrite: Annotated[bool, typer.Option(help="Replace an existing scene.")] = False,
     json: JsonOption = None,
@@ -96,6 +105,11 @@ def build(
         normals=normals,
         splats=splats,
         features=features,
+        positions=positions,
+        position_bits=position_bits,
+        group_epsilon=group_epsilon,
+        pools=pools,
+        pool_bits=pool_bits,
         strict=strict,
         overwrite=overwrite,
     )

@@ -44,6 +44,7 @@ class SceneSection(Section):
 
     path: str = ""
     verify: bool = True
+    delivery: Literal["files", "messages"] = "files"
 
 
 class Box(Section):
@@ -93,6 +94,7 @@ class SamplingSection(Section):
 
     pixel_threshold: Annotated[float, Field(ge=0, le=4096)] = 32.0
     points_per_pixel: Annotated[float, Field(gt=0, le=64)] = 2.0
+    pools: Literal["off", "bytes", "time"] = "off"
 
 
 class RenderSection(Section):
@@ -100,7 +102,7 @@ class RenderSection(Section):
 
     rasterizer: Literal["auto", "cpu", "gl", "gl-points"] = "auto"
     style: Literal["points", "splats"] = "points"
-    positions: Literal["float32", "compact"] = "float32"
+    positions: Literal["float32", "compact", "coded"] = "float32"
     threads: Annotated[int, Field(ge=0, le=1024)] = 0
     point_size_px: Annotated[int, Field(ge=1, le=255)] = 1
     point_size_world: Annotated[float, Field(ge=0)] = 0.0

@@ -30,7 +30,8 @@ _CAMERA = struct.Struct("<16d3d2Id")
 
 RENDER_POINT = np.dtype([("offset", "<u8"), ("range", "<u4"), ("stride", "<u4")])
 """One entry of a render-points array (thesis Table 5-1, wider): the points offset, offset + stride, … below
-offset + range of the point-array."""
+offset + range of the point-array. Stride 0: pooled points instead, numbered cell after cell in stored order over the
+cells that have a pooled form (``Octree.pool_points``), whole cells only."""
 
 FRAMEBUFFER_EMPTY = np.uint64(0xFFFF_FFFF_FFFF_FFFF)
 """Framebuffer word of a pixel no point fell on. Otherwise ``depth bits << 32 | colour word``: depth is float32, the

@@ -40,6 +40,9 @@ class Octree:
         ``FEATURES``.
     quad : (n, 3, 3) float32 or None, of flat cells: centre relative to the cell's centre, and the two half axes of the
         rectangle that covers these points; world units.
+    pool_points : (n,) uint32 or None, points of the pooled form of the cell's own range (``codecs.streams``), which
+        is drawn whole; 0 for a cell that has none.
+    pool_bytes : (n,) uint32 or None, bytes of that form.  pool_bits : bits an axis of its grid; 0 where there is none.
     point_order : ``layered`` (an inner cell owns its own level-of-detail set, of which any prefix is a
         fair sample) or ``depth-first`` (points in leaves only, an inner cell's range spans its leaves).
     """
@@ -59,6 +62,9 @@ class Octree:
     area: np.ndarray | None = None
     feature: np.ndarray | None = None
     quad: np.ndarray | None = None
+    pool_points: np.ndarray | None = None
+    pool_bytes: np.ndarray | None = None
+    pool_bits: int = 0
 
     def __len__(self) -> int:
         return len(self.level)

@@ -11,12 +11,15 @@ from typing import Any
 
 import numpy as np
 
+from .codecs import MAX_BITS, MAX_STREAM_BITS
 from .errors import StoreError
 from .points import ATTRIBUTES
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 SCENE_FILE = "scene.json"
 POINT_ORDERS = ("layered", "depth-first")
+POSITIONS = ("float32", "ci", "eci", "occupancy", "groups")
+"""Forms in which the positions of a scene may be stored: three columns, or one of ``codecs`` cell by cell."""
 UP_AXES = ("x", "y", "z", "-x", "-y", "-z", "auto")
 CELL_ARRAYS = {
     "cell_level": np.dtype("u1"),
@@ -31,7 +34,15 @@ CELL_ARRAYS = {
     "cell_area": np.dtype("<f4"),
     "cell_feature": np.dtype("u1"),
     "cell_quad": np.dtype("<f4"),
+    "cell_position_bytes": np.dtype("<u4"),
+    "cell_pool_points": np.dtype("<u4"),
+    "cell_pool_bytes": np.dtype("<u4"),
 }
+_NEWER_KEYS = {
+    2: ("features",),
+    3: ("positions", "position_bits", "position_bytes", "pool_bits", "pool_bytes"),
+}
+"""Keys that came with a format version; in older scenes they have their defaults."""
 _ROW_SHAPES = {"cell_cone": (4,), "cell_quad": (3, 3)}
 _MAX_BYTES = 1 << 26
 
@@ -64,6 +75,10 @@ class SceneInfo:
     block_levels : in layered order, the points of a cell are relative to the centre of its ancestor this many levels
         above; 0 in depth-first order, where blocks are cells of up to 2048 points or leaves.
     features : whether cells say what their points look like (``cell_feature``, ``cell_quad``).
+    positions : form of the positions, one of ``POSITIONS``.  position_bits : bits an axis of the grid in each cell's
+        cube; 0 for float32.  position_bytes : length of ``position_codes``; 0 for float32.
+    pool_bits : bits an axis of the pooled form that cells have beside their points; 0 where none was built.
+    pool_bytes : length of ``pool_codes``.
     up : the axis that points up, one of ``UP_AXES``.  crs : well-known text, or None.
     build : the settings the scene was built with.
     """
@@ -86,6 +101,11 @@ class SceneInfo:
     build: dict[str, Any]
     arrays: dict[str, ArrayInfo]
     features: bool = False
+    positions: str = "float32"
+    position_bits: int = 0
+    position_bytes: int = 0
+    pool_bits: int = 0
+    pool_bytes: int = 0
     format_version: int = FORMAT_VERSION
 
     @property
@@ -123,8 +143,8 @@ def parse_info(path: Path) -> SceneInfo:
             f"{path}: format_version = {version}, this splatpipe reads up to {FORMAT_VERSION}: "
             "upgrade splatpipe, or build the scene again"
         )
-    if version == 1:
-        content["features"] = False
+    for newer in (key for since, keys in _NEWER_KEYS.items() if version < since for key in keys):
+        content[newer] = SceneInfo.__dataclass_fields__[newer].default
     for field in fields(SceneInfo):
         if field.name not in content:
             raise StoreError(f"{path}: {field.name} not found")
@@ -152,12 +172,20 @@ def expected_arrays(info: SceneInfo) -> dict[str, tuple[np.dtype, tuple[int, ...
         "cell_area": info.point_order == "layered" and info.format_version >= 2,
         "cell_feature": info.features,
         "cell_quad": info.features,
+        "cell_position_bytes": info.positions != "float32",
+        "cell_pool_points": info.pool_bits > 0,
+        "cell_pool_bytes": info.pool_bits > 0,
     }
     for name, dtype in CELL_ARRAYS.items():
         if present.get(name, True):
             expected[name] = (dtype, (info.n_cells, *_ROW_SHAPES.get(name, ())))
-    for name in ("x", "y", "z"):
-        expected[name] = (np.dtype("<f4"), (info.n_stored,))
+    if info.positions == "float32":
+        for name in ("x", "y", "z"):
+            expected[name] = (np.dtype("<f4"), (info.n_stored,))
+    else:
+        expected["position_codes"] = (np.dtype("u1"), (info.position_bytes,))
+    if info.pool_bits:
+        expected["pool_codes"] = (np.dtype("u1"), (info.pool_bytes,))
     for name in info.attributes:
         expected[f"attr_{name}"] = (ATTRIBUTES[name], (info.n_stored,))
     expected["block_first_point"] = (np.dtype("<i8"), (info.n_blocks,))
@@ -227,6 +255,11 @@ _RULES = {
     ),
     "block_levels": _COUNT,
     "features": (lambda v: isinstance(v, bool), "true or false"),
+    "positions": (lambda v: v in POSITIONS, f"one of {', '.join(POSITIONS)}"),
+    "position_bits": (lambda v: _is_count(v) and v <= MAX_BITS, f"a whole number up to {MAX_BITS}"),
+    "position_bytes": _COUNT,
+    "pool_bits": (lambda v: _is_count(v) and v <= MAX_STREAM_BITS, f"a whole number up to {MAX_STREAM_BITS}"),
+    "pool_bytes": _COUNT,
     "up": (lambda v: v in UP_AXES, f"one of {', '.join(UP_AXES)}"),
     "crs": (lambda v: v is None or isinstance(v, str), "a text or null"),
     "sources": (lambda v: isinstance(v, list) and all(_is_source(s) for s in v), "a list of name and n_points"),

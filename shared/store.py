@@ -10,6 +10,10 @@ x, y, z                               float32    stored points, relative to the 
 attr_NAME                             see        one column per attribute (``points.ATTRIBUTES``)
 block_first_point                     int64      blocks of the point-array: first point, ascending from 0
 block_origin                          float64    (b, 3) world origin of each block
+cell_position_bytes, position_codes   <u4, u1    coded positions in place of x, y, z: bytes of each cell's code, and
+                                                 the codes of the cells that own points, in stored order
+cell_pool_points, cell_pool_bytes     <u4        pooled form of each cell: distinct points, and bytes; 0 for none
+pool_codes                            u1         the pooled forms (``codecs.streams``), in stored order of their cells
 ====================================  =========  ======================================================
 
 Opening reads ``scene.json`` and the arrays' headers only. Nothing is unpickled, and no length is believed before it is
@@ -19,6 +23,7 @@ Format versions
     1. The first.
     2. Attribute ``radius``; ``cell_feature``, ``cell_quad`` and the key ``features`` that says whether they are there.
        Layered: sets in stratified order, and ``cell_area``.
+    3. Coded positions and pooled cells, and the keys that say whether they are there.
 """
 
 from __future__ import annotations
@@ -60,16 +65,20 @@ class Scene:
             _data_offset(path / f"{name}.npy", array)
         return cls(path, info)
 
-    def octree(self, *, features: bool = False) -> Octree:
+    def octree(self, *, features: bool = False, pools: bool = False) -> Octree:
         """The cells in memory, checksums and links checked, so that kernels may index by them unchecked.
 
-        features : load what they look like as well.
-        Raises StoreError naming the array or the rule that is broken, or if the scene was built without features.
-        Cost: 43 bytes and about 0.2 µs a cell, 37 bytes more with features.
+        features : load what they look like as well.  pools : load the sizes of their pooled forms as well.
+        Raises StoreError naming the array or the rule that is broken, or if the scene was built without those.
+        Cost: 43 bytes and about 0.2 µs a cell, 37 bytes more with features, 8 with pools.
         """
         if features and not self.info.features:
             raise StoreError(f"{self.path}: no features of cells: build it with --features")
-        left_out = () if features else ("cell_feature", "cell_quad")
+        if pools and not self.info.pool_bits:
+            raise StoreError(f"{self.path}: no pooled cells: build it with --pools")
+        left_out = ["cell_position_bytes"]  # of the positions alone
+        left_out += [] if features else ["cell_feature", "cell_quad"]
+        left_out += [] if pools else ["cell_pool_points", "cell_pool_bytes"]
         arrays = {
             name.removeprefix("cell_"): self._load_checked(name)
             for name in CELL_ARRAYS
@@ -82,6 +91,7 @@ class Scene:
             cone=cone,
             area=area,
             point_order=self.info.point_order,
+            pool_bits=self.info.pool_bits if pools else 0,
             **arrays,
         )
         check_octree(octree, self.info, self.path)
@@ -217,6 +227,11 @@ def check_octree(octree: Octree, info: SceneInfo, path: Path) -> None:
     ends = np.cumsum(count[owner][order])
     tiled = ends[-1] == info.n_stored and np.array_equal(first[owner][order], ends - count[owner][order])
     require(bool(tiled), "first_point", f"the ranges do not tile the {info.n_stored} stored points")
+    if octree.pool_points is not None and octree.pool_bytes is not None:
+        require((octree.pool_points == 0) == (octree.pool_bytes == 0), "pool_bytes", "of a cell without pooled points")
+        require(octree.pool_points <= np.where(owner, count, 0), "pool_points", "more than the cell owns")
+        total = int(octree.pool_bytes.sum(dtype=np.int64))
+        require(total == info.pool_bytes, "pool_bytes", f"their sum is not {info.pool_bytes}")
     if octree.area is not None:
         require(np.isfinite(octree.area) & (octree.area > 0), "area", "not a finite number > 0")
     if octree.cone is not None:

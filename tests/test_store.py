@@ -120,7 +120,7 @@ def test_arrays_of_the_wrong_size_are_refused_at_once(scene, damage):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"format_version": 3}, r"format_version = 3, this splatpipe reads up to 2: upgrade splatpipe"),
+        ({"format_version": 4}, r"format_version = 4, this splatpipe reads up to 3: upgrade splatpipe"),
         ({"format_version": "1"}, "format_version = '1', expected a whole number"),
         ({"edge": -1.0}, "edge = -1.0, expected a number > 0"),
         ({"edge": "removed"}, "edge not found"),

@@ -15,6 +15,7 @@ from ..points import PointBatch
 from ..readers.source import Source
 from ..scene_info import SceneInfo, SourceCount
 from .assembly import Assembly
+from .coded_positions import code_positions
 from .features import cell_features
 from .ingest import Bounds, Columns, Tally, declared_bounds, finite_batches, planned_attributes, root_bounds
 from .morton import keys_of, root_cube
@@ -22,6 +23,7 @@ from .neighbours import SurfaceRule, add_surface
 from .parallel import Workers
 from .partition import Subdivision
 from .point_array import PointArrayWriter, block_level, block_levels_of
+from .pooled import pool_positions, suited_bits
 from .runs import Partition, Runs
 from .settings import BuildReport, BuildSettings, MemoryPlan, peak_resident_bytes, plan_memory
 from .streamed import append_streamed_leaf
@@ -220,6 +222,24 @@ class _Build:
         if self.settings.features:
             with self.timed("features"):
                 cells |= cell_features(cells, origin, edge, first, block_origin, self.writer.written, self.workers)
+        position_bytes = pool_bytes = pool_bits = 0
+        if self.settings.positions != "float32":
+            with self.timed("positions"):
+                cells |= code_positions(
+                    cells,
+                    origin,
+                    edge,
+                    float(np.max(tally.upper - tally.lower)),
+                    self.settings,
+                    self.writer,
+                    self.workers,
+                )
+                position_bytes = int(cells["cell_position_bytes"].sum(dtype=np.int64))
+        if self.settings.pools:
+            with self.timed("pools"):
+                pool_bits = self.settings.pool_bits or suited_bits(self.settings.points_per_cell)
+                cells |= pool_positions(cells, origin, edge, pool_bits, self.settings, self.writer, self.workers)
+                pool_bytes = int(cells["cell_pool_bytes"].sum(dtype=np.int64))
         for name, values in {**cells, "block_first_point": first, "block_origin": block_origin}.items():
             self.writer.write_array(name, values)
         info = SceneInfo(
@@ -235,6 +255,11 @@ class _Build:
             n_dropped=tally.n_dropped,
             attributes=self.attributes,
             features=self.settings.features,
+            positions=self.settings.positions,
+            position_bits=self.settings.position_bits if position_bytes else 0,
+            position_bytes=position_bytes,
+            pool_bits=pool_bits,
+            pool_bytes=pool_bytes,
             block_levels=block_levels_of(self.settings.point_order, self.settings.points_per_cell),
             up=self.settings.up,
             crs=next((s.info.crs for s in self.sources if s.info.crs), None),

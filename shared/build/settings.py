@@ -7,10 +7,11 @@ import resource
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from ..codecs import MAX_BITS, MAX_STREAM_BITS
 from ..errors import InputError
 from ..octree import MAX_LEVEL
 from ..points import ATTRIBUTES
-from ..scene_info import POINT_ORDERS, UP_AXES
+from ..scene_info import POINT_ORDERS, POSITIONS, UP_AXES
 
 NORMALS = ("keep", "estimate")
 
@@ -32,6 +33,12 @@ class BuildSettings:
         ``neighbours``.
     splats : store what splats need: radii, and normals, estimated where not all inputs have them.
     features : store which cells are flat, edges and corners, see ``features``; splats with them.
+    positions : form in which positions are stored, one of ``scene_info.POSITIONS``; codecs other than float32 round
+        them to a grid of ``position_bits`` bits an axis in the cube of their cell.
+    group_epsilon : ε of ``groups``, as a share of the longest side of the scene's bounds.
+    pools : store cells that gain by it in pooled form (``codecs.streams``) beside their points.
+    pool_bits : bits an axis of the pooled form's grid; 0: as suits ``points_per_cell``.
+    n_pools : most pools of a cell.
     threads : None for one a core.
 
     Raises InputError for a value out of range.
@@ -49,6 +56,12 @@ class BuildSettings:
     normals: str = "keep"
     splats: bool = False
     features: bool = False
+    positions: str = "float32"
+    position_bits: int = 12
+    group_epsilon: float = 0.005
+    pools: bool = False
+    pool_bits: int = 0
+    n_pools: int = 2
     threads: int | None = None
 
     def __post_init__(self) -> None:
@@ -62,6 +75,11 @@ class BuildSettings:
             (self.up in UP_AXES, "up", f"one of {', '.join(UP_AXES)}"),
             (not unknown, "attributes", f"names of {', '.join(ATTRIBUTES)}"),
             (self.normals in NORMALS, "normals", f"one of {', '.join(NORMALS)}"),
+            (self.positions in POSITIONS, "positions", f"one of {', '.join(POSITIONS)}"),
+            (1 <= self.position_bits <= MAX_BITS, "position_bits", f"1 … {MAX_BITS}"),
+            (0 <= self.group_epsilon <= 1, "group_epsilon", "a number in [0, 1]"),
+            (0 <= self.pool_bits <= MAX_STREAM_BITS, "pool_bits", f"0 … {MAX_STREAM_BITS}"),
+            (1 <= self.n_pools <= 16, "n_pools", "1 … 16"),
             (self.threads is None or self.threads >= 1, "threads", "at least 1"),
         ):
             if not holds:

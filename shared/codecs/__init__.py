@@ -40,6 +40,9 @@ import numpy as np
 MAX_BITS = 21
 """Most bits an axis: three of them fit a Morton code of 63."""
 
+MAX_STREAM_BITS = 8
+"""Most bits an axis of transformation streams: above, scans are sparse on the grid, and translations long."""
+
 
 @dataclass(frozen=True)
 class Encoded:

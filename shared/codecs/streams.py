@@ -31,7 +31,7 @@ import numpy as np
 from numba import njit
 
 from ..errors import CodecError
-from . import Encoded
+from . import MAX_STREAM_BITS, Encoded
 from .container import read_head, write_head
 from .grid import check_points
 from .order import distinct, gather_runs, sorted_order
@@ -43,7 +43,6 @@ name = "streams"
 DEFAULT_BITS = 7
 """Bits an axis: enough for a cell that is at most 128/√2 px wide and high on the screen (section 6)."""
 
-MAX_STREAM_BITS = 8
 MOST_TRANSLATIONS = 256
 POINT_BYTES = 3
 

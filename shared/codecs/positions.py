@@ -1,0 +1,27 @@
+"""The codecs that a scene may store the positions of its cells with, by name."""
+
+from __future__ import annotations
+
+from ..errors import CodecError
+from . import Codec
+
+
+def position_codec(name: str, epsilon: float = 0.0) -> Codec:
+    """The codec of one of ``scene_info.POSITIONS`` but float32; imports that one only.
+
+    epsilon : of ``groups``, grid steps; decoding needs none.  Raises CodecError for another name.
+    """
+    match name:
+        case "ci":
+            from . import ci as codec
+        case "eci":
+            from . import eci as codec
+        case "occupancy":
+            from . import occupancy as codec
+        case "groups":
+            from .linear_groups import LinearGroupCodec
+
+            return LinearGroupCodec(epsilon)
+        case _:
+            raise CodecError(f"codec of positions: found {name!r}, expected ci, eci, occupancy or groups")
+    return codec
