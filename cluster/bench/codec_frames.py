@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from ...nodes.raster import ResidentPoints, kernels
-from ...nodes.raster.blocks import frustum
-from ...nodes.raster.cpu import TURNS_PER_THREAD, CpuRasterizer, framebuffers_worth
+from ...nodes.raster import PointSize, ResidentPoints
+from ...nodes.raster.cpu import CpuRasterizer
+from ...nodes.raster.framebuffers import FramebufferRasterizer
 from ...nodes.raster.groups import draw_groups, group_cells
 from ...nodes.raster.pools import PoolCell, draw_pools, pool_cells
 from ...shared.camera import Camera
 from ...shared.codecs import linear_groups, streams
 from ...shared.codecs.palette import to_palette
-from ...shared.messages import FRAMEBUFFER_EMPTY, RENDER_POINT
+from ...shared.messages import RENDER_POINT
 from .codec_cells import Cell
 
 Draw = Callable[[], np.ndarray]
@@ -54,8 +53,8 @@ def pools_frame(
         palette, colour = to_palette(cell.colour[order])
         pooled = streams.read_pools(coded, bits, len(order))
         held.append(PoolCell(pooled, cell.lower, cell.edge / 2**bits, palette, colour))
-    with _kernel_frame(draw_pools, pool_cells(held), len(cells), sum(map(len, orders)), camera) as draw:
-        yield draw
+    with _CellRasterizer(draw_pools, pool_cells(held), len(cells), sum(map(len, orders)), camera) as rasterizer:
+        yield rasterizer.draw
 
 
 @contextmanager
@@ -70,35 +69,18 @@ def groups_frame(
         np.zeros(len(cells)),
         np.concatenate([cell.colour[order] for cell, order in zip(cells, orders, strict=True)]),
     )
-    with _kernel_frame(draw_groups, held, len(cells), sum(map(len, orders)), camera) as draw:
-        yield draw
+    with _CellRasterizer(draw_groups, held, len(cells), sum(map(len, orders)), camera) as rasterizer:
+        yield rasterizer.draw
 
 
-@contextmanager
-def _kernel_frame(kernel: Any, form: Any, n_cells: int, n_points: int, camera: Camera) -> Iterator[Draw]:
-    """Drawn by a kernel of encoded cells, with as many threads and framebuffers as ``CpuRasterizer`` takes."""
-    threads = len(os.sched_getaffinity(0))
-    n = framebuffers_worth(n_points, threads, camera.width * camera.height)
-    pitch = kernels.pitch_of(camera.width)
-    words = np.full((n, camera.height * pitch + 1), FRAMEBUFFER_EMPTY)
-    words[:, -1] = 0
-    dirty = np.zeros((n, camera.height * pitch // kernels.RUN + 1), np.uint8)
-    frame = np.empty((camera.height, camera.width), np.uint64)
-    filled = np.ones(camera.height * pitch // kernels.RUN, np.uint8)
-    near, columns, rows, one = map(np.float32, (camera.near, camera.width, camera.height, 1))
-    view = kernels.View(near, columns, rows, one, one, np.int32(pitch), True)
-    every, turn = np.arange(n_cells), max(1, n_cells // (n * TURNS_PER_THREAD))
+class _CellRasterizer(FramebufferRasterizer):
+    """Draws all cells of an encoded form with its kernel."""
 
-    with ThreadPoolExecutor(threads) as executor:
+    def __init__(self, kernel: Any, form: Any, n_cells: int, n_points: int, camera: Camera) -> None:
+        super().__init__(camera.width, camera.height, PointSize(), None)
+        self._camera, self._n_points = camera, n_points
+        self._work = partial(kernel, form, np.arange(n_cells)), n_cells
 
-        def draw() -> np.ndarray:
-            seen, counter, merged = frustum(camera, 1.5), np.zeros(1, np.int64), np.zeros(1, np.int64)
-            for _ in executor.map(
-                lambda i: kernel(form, every, seen, view, words[i], dirty[i], turn, counter), range(n)
-            ):
-                pass
-            for _ in executor.map(lambda _: kernels.merge(words, dirty, frame, filled, merged), range(threads)):
-                pass
-            return frame
-
-        yield draw
+    def draw(self) -> np.ndarray:
+        """As of ``Draw``."""
+        return self._draw_frame(self._camera, self._n_points, self._work)
