@@ -37,16 +37,20 @@ class SamplingNode:
         those suffice; 0 draws every visible point.
     points_per_pixel : points of a set in stratified order, for each pixel that the surface in its cell covers where it
         is seen face on (``Octree.area``); ``SHARP_DENSITY`` times as many where the octree tells edges and corners.
+    whole_sets : draw a cut cell with all its points, where a head of them has no meaning (linear groups).
     Raises ConfigError for a threshold that is not a finite number ≥ 0, or points per pixel that are not one > 0.
     """
 
-    def __init__(self, octree: Octree, *, pixel_threshold: float, points_per_pixel: float = 2.0):
+    def __init__(
+        self, octree: Octree, *, pixel_threshold: float, points_per_pixel: float = 2.0, whole_sets: bool = False
+    ):
         if not (pixel_threshold >= 0 and math.isfinite(pixel_threshold)):
             raise ConfigError(f"sampling.pixel_threshold = {pixel_threshold}, expected a number ≥ 0")
         if not (points_per_pixel > 0 and math.isfinite(points_per_pixel)):
             raise ConfigError(f"sampling.points_per_pixel = {points_per_pixel}, expected a number > 0")
         self.pixel_threshold = float(pixel_threshold)
         self.points_per_pixel = float(points_per_pixel)
+        self.whole_sets = whole_sets
         self._octree = octree
         self._edge = np.ldexp(octree.edge, -np.arange(MAX_LEVEL + 1))
         self._stored_order = np.argsort(octree.first_point, kind="stable").astype(np.int32)
@@ -66,7 +70,8 @@ class SamplingNode:
         square of its projected size and A its area, a cell whose points stand in stratified order yields the first
         max(1, ⌊``points_per_pixel`` A N⌋) of them, or all. Any other cell below the threshold yields at least
         min(its points, max(1, ⌊N ln N⌋)): the head of its range in layered order, every stride-th of the range in
-        depth-first order; and a leaf above the threshold all its points.
+        depth-first order; and a leaf above the threshold all its points. With ``whole_sets`` the same cells yield all
+        the points of their range, in entries of stride 1.
 
         Raises MessageError if the bits belong to another frame or another octree.
         Cost: O(cells in the level-of-detail window) plus a scan of one word per cell. With a threshold of 0 no
@@ -79,6 +84,8 @@ class SamplingNode:
                 f" expected frame {camera.frame} of {len(tree)}"
             )
         n_cut = self._cut(camera, bits) if self.pixel_threshold else self._all_leaves(bits)
+        if self.whole_sets:
+            np.copyto(self._n_drawn, tree.n_points, where=self._n_drawn > 0)
         entries = np.empty(n_cut + self._n_splits, RENDER_POINT)
         strided = tree.point_order == "depth-first"
         n_entries = _merge(

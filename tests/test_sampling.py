@@ -79,13 +79,17 @@ def with_areas(octree):
 
 
 @EXAMPLES
-@given(scenes(), THRESHOLDS, st.booleans())
-def test_draws_exactly_the_points_of_its_twin(scene, threshold, stratified):
+@given(scenes(), THRESHOLDS, st.booleans(), st.booleans())
+def test_draws_exactly_the_points_of_its_twin(scene, threshold, stratified, whole):
     cloud, camera = scene
     octree = with_areas(cloud.octree) if stratified else cloud.octree
     bits = CullingNode(octree, backface=True).process(camera)
-    message = SamplingNode(octree, pixel_threshold=threshold, points_per_pixel=DENSITY).process(camera, bits)
+    node = SamplingNode(octree, pixel_threshold=threshold, points_per_pixel=DENSITY, whole_sets=whole)
+    message = node.process(camera, bits)
     drawn = cut_twin(octree, camera, bits.unpack(), threshold)
+    if whole:
+        drawn = {cell: int(octree.n_points[cell]) for cell in drawn}
+        assert (message.entries["stride"] == 1).all()
     unmerged = [points_of(octree, cell, n) for cell, n in drawn.items()]
     np.testing.assert_array_equal(expand(message.entries), np.sort(np.concatenate([np.empty(0, int), *unmerged])))
     assert message.frame == camera.frame
