@@ -89,7 +89,7 @@ class PoolCell:
 
 
 def pool_cells(cells: Sequence[PoolCell]) -> PoolCells:
-    """Cells put together, at least one. Cost: a copy of their arrays."""
+    """Cells put together. Cost: a copy of their arrays."""
     held = [cell.points for cell in cells]
     pools = [pool for points in held for pool in points.pools]
 
@@ -100,10 +100,10 @@ def pool_cells(cells: Sequence[PoolCell]) -> PoolCells:
         return np.concatenate([np.empty((0, *shape), dtype), *arrays])
 
     return PoolCells(
-        np.array([cell.origin for cell in cells], np.float64),
+        np.array([cell.origin for cell in cells], np.float64).reshape(-1, 3),
         np.array([cell.step for cell in cells], np.float64),
         np.array([cell.world_side for cell in cells], np.float64),
-        np.array([np.resize(cell.palette, 256) for cell in cells], np.uint32),
+        np.array([np.resize(cell.palette, 256) for cell in cells], np.uint32).reshape(-1, 256),
         joined([cell.colour for cell in cells], np.uint8),
         first([len(points.pools) for points in held]),
         first([len(points.loose) for points in held]),

@@ -238,7 +238,20 @@ class _Build:
         if self.settings.pools:
             with self.timed("pools"):
                 pool_bits = self.settings.pool_bits or suited_bits(self.settings.points_per_cell)
-                cells |= pool_positions(cells, origin, edge, pool_bits, self.settings, self.writer, self.workers)
+                x, y, z = (self.writer.written(name) for name in "xyz")
+                cells |= pool_positions(
+                    cells,
+                    origin,
+                    edge,
+                    first,
+                    block_origin,
+                    lambda begin, end: (x[begin:end], y[begin:end], z[begin:end]),
+                    pool_bits,
+                    self.settings,
+                    self.writer,
+                    self.workers,
+                    lambda done, total: self.progress("pools", done, total),
+                )
                 pool_bytes = int(cells["cell_pool_bytes"].sum(dtype=np.int64))
         for name, values in {**cells, "block_first_point": first, "block_origin": block_origin}.items():
             self.writer.write_array(name, values)

@@ -128,6 +128,12 @@ def read_pools(data: np.ndarray, bits: int, most_points: int) -> PooledPoints:
     return _read(data, bits, most_points)[0]
 
 
+def read_with_points(data: np.ndarray, bits: int, most_points: int) -> tuple[PooledPoints, np.ndarray]:
+    """As ``read_pools``, and (n, 3) uint32: the same points in coded order."""
+    pooled, points, _ = _read(data, bits, most_points)
+    return pooled, points
+
+
 def _check_bits(bits: int) -> None:
     if not 1 <= bits <= MAX_STREAM_BITS:
         raise CodecError(f"bits: found {bits}, expected 1 … {MAX_STREAM_BITS}")
