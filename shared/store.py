@@ -29,13 +29,13 @@ Format versions
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .array_source import ArrayFiles, ArraySource
 from .errors import StoreError
 from .octree import FEATURES, MAX_LEVEL, Octree
 from .scene_info import CELL_ARRAYS, SCENE_FILE, ArrayInfo, SceneInfo, parse_info
@@ -44,14 +44,16 @@ _CHUNK = 1 << 22
 
 
 class Scene:
-    """A scene on disk. Get one by ``Scene.open``; nothing is held open between calls, so there is nothing to close.
+    """A scene. Get one on disk by ``Scene.open``; nothing is held open between calls, so there is nothing to close.
 
-    path : the directory.  info : ``SceneInfo``.
+    path : the directory; of a scene that stands on other arrays, what errors call it.  info : ``SceneInfo``.
+    arrays : where its arrays come from; default: the files of the directory.
     """
 
-    def __init__(self, path: Path, info: SceneInfo) -> None:
+    def __init__(self, path: Path, info: SceneInfo, arrays: ArraySource | None = None) -> None:
         self.path = path
         self.info = info
+        self._arrays = ArrayFiles(path, info) if arrays is None else arrays
 
     @classmethod
     def open(cls, path: str | Path) -> Scene:
@@ -61,9 +63,9 @@ class Scene:
         """
         path = Path(path)
         info = parse_info(path / SCENE_FILE)
-        for name, array in info.arrays.items():
-            _data_offset(path / f"{name}.npy", array)
-        return cls(path, info)
+        files = ArrayFiles(path, info)
+        files.check_sizes()
+        return cls(path, info, files)
 
     def octree(self, *, features: bool = False, pools: bool = False) -> Octree:
         """The cells in memory, checksums and links checked, so that kernels may index by them unchecked.
@@ -136,16 +138,13 @@ class Scene:
         total = sum(self.info.arrays[name].bytes for name in names)
         done = 0
         for name in names:
-            path, array = self.path / f"{name}.npy", self.info.arrays[name]
             crc = 0
-            with _reading(path), path.open("rb") as file:
-                file.seek(_data_offset(path, array))
-                while chunk := file.read(_CHUNK):
-                    crc = zlib.crc32(chunk, crc)
-                    done += len(chunk)
-                    if progress:
-                        progress("check", done, total)
-            _expect_crc(path, crc, array)
+            for chunk in self._arrays.chunks(name):
+                crc = zlib.crc32(chunk, crc)
+                done += len(chunk)
+                if progress:
+                    progress("check", done, total)
+            _expect_crc(self.path / f"{name}.npy", crc, self.info.arrays[name])
 
     def verify(self, progress: Callable[[str, int, int | None], None] | None = None) -> None:
         """Check everything: checksums, links of the octree, blocks, and that each point lies in its cell's cube.
@@ -178,11 +177,16 @@ class Scene:
             if progress:
                 progress("points", stop, self.info.n_stored)
 
+    def stored_bytes(self, name: str) -> np.ndarray:
+        """(n,) uint8: the bytes of an array as they are stored, mapped and unchecked, for sending them on."""
+        return self._load(name, mmap=True).reshape(-1).view(np.uint8)
+
+    def release(self) -> None:
+        """Say that no array will be asked for any more. Files need it not; a scene that another rank sends does."""
+        self._arrays.release()
+
     def _load(self, name: str, mmap: bool) -> np.ndarray:
-        path = self.path / f"{name}.npy"
-        _data_offset(path, self.info.arrays[name])
-        with _reading(path):
-            return np.load(path, mmap_mode="r" if mmap else None, allow_pickle=False)
+        return self._arrays.load(name, mmap)
 
     def _load_checked(self, name: str) -> np.ndarray:
         array = self._load(name, mmap=False)
@@ -250,32 +254,6 @@ def check_octree(octree: Octree, info: SceneInfo, path: Path) -> None:
     if octree.feature is not None and octree.quad is not None:
         require(octree.feature < len(FEATURES), "feature", f"above {len(FEATURES) - 1}")
         require(np.isfinite(octree.quad).all(axis=(1, 2)), "quad", "not finite")
-
-
-@contextmanager
-def _reading(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except FileNotFoundError:
-        raise StoreError(f"{path}: not found, expected an array of the scene") from None
-    except (OSError, ValueError, SyntaxError) as error:
-        raise StoreError(f"{path}: cannot be read: {error}") from error
-
-
-def _data_offset(path: Path, promised: ArrayInfo) -> int:
-    """Where the data of an array begin, after its header and the file's size were held against the promise."""
-    with _reading(path), path.open("rb") as file:
-        version = np.lib.format.read_magic(file)
-        if version != (1, 0):
-            raise StoreError(f"{path}: found npy version {version}, expected (1, 0)")
-        shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
-        offset = file.tell()
-    if (shape, fortran, dtype.str) != (promised.shape, False, promised.dtype):
-        raise StoreError(f"{path}: header says {dtype.str} {shape}, expected {promised.dtype} {promised.shape}")
-    size = path.stat().st_size
-    if size != offset + promised.bytes:
-        raise StoreError(f"{path}: found {size} bytes, expected {offset + promised.bytes}")
-    return offset
 
 
 def _expect_crc(path: Path, found: int, promised: ArrayInfo) -> None:
