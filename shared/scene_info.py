@@ -44,7 +44,8 @@ _NEWER_KEYS = {
 }
 """Keys that came with a format version; in older scenes they have their defaults."""
 _ROW_SHAPES = {"cell_cone": (4,), "cell_quad": (3, 3)}
-_MAX_BYTES = 1 << 26
+MAX_INFO_BYTES = 1 << 26
+"""Longest ``scene.json`` that is read."""
 
 
 @dataclass(frozen=True)
@@ -124,13 +125,20 @@ def parse_info(path: Path) -> SceneInfo:
     Raises StoreError if it is missing, not JSON, of a newer version, or a key is missing or of the wrong kind.
     """
     try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise StoreError(f"{path}: found {path.stat().st_size} bytes, expected at most {_MAX_BYTES}")
-        content = json.loads(path.read_text(encoding="utf-8"))
+        if path.stat().st_size > MAX_INFO_BYTES:
+            raise StoreError(f"{path}: found {path.stat().st_size} bytes, expected at most {MAX_INFO_BYTES}")
+        text = path.read_bytes()
     except FileNotFoundError:
         raise StoreError(f"{path.parent}: not a scene: {path.name} not found") from None
     except OSError as error:
         raise StoreError(f"{path}: cannot be read: {error.strerror}") from error
+    return info_from_json(text, path)
+
+
+def info_from_json(text: bytes, path: Path) -> SceneInfo:
+    """The checked content of the text of a ``scene.json``; ``path`` is what errors call it. Raises StoreError."""
+    try:
+        content = json.loads(text.decode("utf-8"))
     except (ValueError, RecursionError) as error:
         raise StoreError(f"{path}: not valid JSON: {error}") from error
     if not isinstance(content, dict):
@@ -250,7 +258,7 @@ _RULES = {
     "n_blocks": _POSITIVE,
     "n_dropped": _COUNT,
     "attributes": (
-        lambda v: isinstance(v, list) and len(set(map(str, v))) == len(v) and all(a in ATTRIBUTES for a in v),
+        lambda v: isinstance(v, list) and len(set(map(str, v))) == len(v) and set(map(str, v)) <= set(ATTRIBUTES),
         f"different names of {', '.join(ATTRIBUTES)}",
     ),
     "block_levels": _COUNT,
