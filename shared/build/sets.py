@@ -1,17 +1,13 @@
 """Sets of points that cells own, and the order inside them: leaves, and inner cells with samples of their children.
 
-Layered: points stand in *stratified* order. Along the Morton curve of its cell the point of rank r comes at the place
-that r's bits say when read backwards (van der Corput 1935), so the first m points of a set cut the curve into m nearly
-equal parts: they are spread over the cell as evenly as its points are, and cover a surface with about half the points
-that a random choice takes. Consecutive points lie half a cell apart and do not fall on one pixel. An inner cell merges
-the first points of its children, which are in the order of its curve already, so only leaves are sorted.
+Layered: points stand in *stratified* order (``set_order``): any prefix is spread evenly over the cell. An inner cell
+merges the first points of its children, which are in the order of its curve already, so only leaves are sorted.
 
 How many points cover a cell depends on how much surface is inside, its *area*: the share of the cells of a grid in a
 leaf that hold points, in faces of the leaf's cube, and the sum over the children for an inner cell.
 
 Leaves with more points than a cell may hold (coincident points, flat cells, the deepest level), which may be larger
-than memory, and depth-first leaves, which are thinned by stride, stand in random order instead: a permutation seeded by
-the cell's level and code and evaluated point by point.
+than memory, and depth-first leaves, which are thinned by stride, stand in random order instead.
 """
 
 from __future__ import annotations
@@ -22,16 +18,11 @@ import numpy as np
 from numba import njit
 
 from ..octree import MAX_LEVEL
+from ..set_order import next_reversed, permutation, place, strata, stratify
 from .parallel import Workers
 
 if TYPE_CHECKING:
     from .subtree import LinkedCells
-
-_GOLDEN = np.uint64(0x9E3779B97F4A7C15)
-_MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
-_MIX_2 = np.uint64(0x94D049BB133111EB)
-_S27, _S30, _S31 = np.uint64(27), np.uint64(30), np.uint64(31)
-_ONE = np.uint64(1)
 
 _RADIX_BITS = 9
 _SORTED_LEVELS = 6
@@ -43,84 +34,6 @@ _POINTS_PER_PLACE = 4
 """Fewer points for each place of a grid that holds any do not tell which others the surface goes through."""
 RANDOM_AREA = 3.0
 """Area of a leaf in random order: ln N times as many points cover it (thesis 4.3.2), a few times what strata take."""
-
-
-@njit(nogil=True, cache=True)
-def _mixed(x):
-    """SplitMix64's finaliser (Steele, Lea, Flood 2014)."""
-    x = (x ^ (x >> _S30)) * _MIX_1
-    x = (x ^ (x >> _S27)) * _MIX_2
-    return x ^ (x >> _S31)
-
-
-@njit(nogil=True, cache=True)
-def permutation(level, code, n, p):
-    """Fill (6,) uint64 ``p`` with the parameters of the permutation of [0, n) that belongs to a cell."""
-    state = _mixed(np.uint64(code) + np.uint64(level + 1) * _GOLDEN)
-    bits = 1
-    while (1 << bits) < n:
-        bits += 1
-    p[0] = (np.uint64(1) << np.uint64(bits)) - _ONE
-    p[1] = np.uint64((bits + 1) // 2)
-    for k in range(2, 6):
-        state += _GOLDEN
-        p[k] = _mixed(state)
-    p[2] |= _ONE
-    p[3] |= _ONE
-    p[4] |= _ONE
-
-
-@njit(nogil=True, cache=True)
-def place(i, n, p):
-    """Where the i-th of n goes: odd multiplications and shifts permute [0, 2**bits); walk until below n."""
-    if n == 1:
-        return 0
-    x = np.uint64(i)
-    mask, half = p[0], p[1]
-    while True:
-        x = (x * p[2] + p[5]) & mask
-        x ^= x >> half
-        x = (x * p[3]) & mask
-        x ^= x >> half
-        x = (x * p[4]) & mask
-        x ^= x >> half
-        if x < np.uint64(n):
-            return np.int64(x)
-
-
-@njit(nogil=True, cache=True)
-def _strata(level, code, n):
-    """(top, mask) of the stratified order of n points of a cell: the highest bit of a rank, and the cell's own start.
-
-    The mask, a random word, decides which point of each stratum comes first, so that no side of a cell is preferred.
-    """
-    top = np.int64(1)
-    while top < n:
-        top <<= 1
-    mask = np.int64(_mixed(np.uint64(code) + np.uint64(level + 1) * _GOLDEN) & np.uint64(top - 1))
-    return top >> 1, mask
-
-
-@njit(nogil=True, cache=True)
-def _next_reversed(i, top):
-    """One more, in a number whose bits are read backwards from ``top`` on."""
-    bit = top
-    while i & bit:
-        i ^= bit
-        bit >>= 1
-    return i | bit
-
-
-@njit(nogil=True, cache=True)
-def _stratify(level, code, in_order, begin, n, stored, first):
-    """Write the n ids ``in_order[begin:]``, which stand along the curve, to ``stored[first:]`` in stratified order."""
-    top, mask = _strata(level, code, n)
-    i, done = 0, 0
-    while done < n:
-        if i ^ mask < n:
-            stored[first + done] = in_order[begin + (i ^ mask)]
-            done += 1
-        i = _next_reversed(i, top)
 
 
 @njit(nogil=True, cache=True)
@@ -175,7 +88,7 @@ def stratify_leaves(which, level, code, start, count, first_point, capacity, key
             area[cell] = RANDOM_AREA
         else:
             _sort_along_curve(keys, ids, start[cell], count[cell], level[cell], scratch)
-            _stratify(level[cell], code[cell], ids, start[cell], count[cell], stored, first_point[cell])
+            stratify(level[cell], code[cell], ids, start[cell], count[cell], stored, first_point[cell])
             area[cell] = _area(keys, ids, start[cell], count[cell], level[cell])
 
 
@@ -236,7 +149,7 @@ def sample_children(which, level, code, first_child, n_children, first_point, n_
             else:
                 _into_curve_order(level[c], code[c], n_points[c], taken, by_rank, merged[n_merged:])
             n_merged += len(taken)
-        _stratify(level[cell], code[cell], merged, 0, n, stored, first_point[cell])
+        stratify(level[cell], code[cell], merged, 0, n, stored, first_point[cell])
 
 
 @njit(nogil=True, cache=True)
@@ -245,13 +158,13 @@ def _into_curve_order(level, code, n, taken, by_rank, merged):
 
     by_rank : (≥ n,) uint32, all ``_NONE``, and left so.
     """
-    top, mask = _strata(level, code, n)
+    top, mask = strata(level, code, n)
     i, done = 0, 0
     while done < len(taken):
         if i ^ mask < n:
             by_rank[i ^ mask] = taken[done]
             done += 1
-        i = _next_reversed(i, top)
+        i = next_reversed(i, top)
     done = 0
     for rank in range(n):
         if by_rank[rank] != _NONE:

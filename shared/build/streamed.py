@@ -8,13 +8,14 @@ import numpy as np
 from numba import njit
 
 from ..points import PointBatch
+from ..set_order import permutation, place
 from .cones import add_normals, start_cone, widen_cone
 from .ingest import Columns
 from .neighbours import SurfaceRule, add_surface
 from .parallel import Workers
 from .point_array import PointArrayWriter, block_level
 from .runs import Partition, Runs
-from .sets import RANDOM_AREA, permutation, place
+from .sets import RANDOM_AREA
 from .settings import BuildSettings
 from .subtree import LinkedCells
 
