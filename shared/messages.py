@@ -9,7 +9,17 @@ message            from → to                     payload
 ``Camera``         coordinator → all             clip_from_world, eye, viewport, near
 ``VisibilityBits`` culling → sampling            1 bit a cell, breadth-first, packed (least significant first)
 ``RenderPoints``   sampling → render             entries of (offset, range, stride)
+``SceneOffer``     sampling → render             ``scene.json`` and the colour mode
+``SceneRequest``   render → sampling             array, first byte, number of bytes; nothing: no more is needed
+``SceneBytes``     sampling → render             the bytes asked for, as they are stored
 =================  ============================  ============================================================
+
+The last three cross before the first frame, where ``scene.delivery`` is ``messages``. Their header has the number of
+the request in place of the frame's.
+
+Protocol versions
+    1. The first.
+    2. Scenes by messages.
 """
 
 from __future__ import annotations
@@ -17,16 +27,24 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 from enum import IntEnum
+from pathlib import Path
 
 import numpy as np
 
 from .camera import Camera
-from .errors import MessageError
+from .errors import MessageError, StoreError
+from .scene_info import MAX_INFO_BYTES, SceneInfo, info_from_json
 
 MAGIC = b"SPLT"
-PROTOCOL_VERSION = 1
+PROTOCOL_VERSION = 2
 HEADER = struct.Struct("<4sHHQQ")
 _CAMERA = struct.Struct("<16d3d2Id")
+_SCENE_REQUEST = struct.Struct("<IIQ")
+_MAX_COLOUR_BYTES = 64
+MAX_OFFER_BYTES = _MAX_COLOUR_BYTES + 1 + MAX_INFO_BYTES
+MAX_REQUEST_BYTES = _SCENE_REQUEST.size
+SCENE_PIECE_BYTES = 8 << 20
+"""Most bytes that one ``SceneRequest`` may ask for."""
 
 RENDER_POINT = np.dtype([("offset", "<u8"), ("range", "<u4"), ("stride", "<u4")])
 """One entry of a render-points array (thesis Table 5-1, wider): the points offset, offset + stride, … below
@@ -46,6 +64,9 @@ class Kind(IntEnum):
     RENDER_POINTS = 3
     FRAME_DONE = 4
     STATISTICS = 5
+    SCENE_OFFER = 6
+    SCENE_REQUEST = 7
+    SCENE_BYTES = 8
 
 
 @dataclass(frozen=True)
@@ -83,7 +104,40 @@ class RenderPoints:
         return int(((self.entries["range"].astype(np.int64) + stride - 1) // stride).sum())
 
 
-Message = Camera | VisibilityBits | RenderPoints
+@dataclass(frozen=True)
+class SceneOffer:
+    """What the sampling rank says of its scene before it is asked for arrays.
+
+    colour : the run's ``render.colour``, ``auto`` settled: finding out takes a look at attributes it may not settle on.
+    """
+
+    info: SceneInfo
+    colour: str
+
+
+@dataclass(frozen=True)
+class SceneRequest:
+    """Asks for a part of an array of the offered scene.
+
+    number : of the request; the reply has the same.  array : position in ``info.arrays``.
+    first, n_bytes : which of its bytes, at most ``SCENE_PIECE_BYTES``; 0: no more requests follow.
+    """
+
+    number: int
+    array: int
+    first: int
+    n_bytes: int
+
+
+@dataclass(frozen=True)
+class SceneBytes:
+    """The bytes that a request asked for. data : (n,) uint8."""
+
+    number: int
+    data: np.ndarray
+
+
+Message = Camera | VisibilityBits | RenderPoints | SceneOffer | SceneRequest | SceneBytes
 
 
 def header(kind: Kind, frame: int, length: int) -> bytes:
@@ -126,6 +180,15 @@ def encode(message: Message) -> tuple[bytes, memoryview]:
         case RenderPoints():
             payload = np.ascontiguousarray(message.entries).view(np.uint8).data
             return header(Kind.RENDER_POINTS, message.frame, len(payload)), payload
+        case SceneOffer():
+            payload = memoryview(f"{message.colour}\n{message.info.to_json()}".encode())
+            return header(Kind.SCENE_OFFER, 0, len(payload)), payload
+        case SceneRequest():
+            request = _SCENE_REQUEST.pack(message.array, message.n_bytes, message.first) if message.n_bytes else b""
+            return header(Kind.SCENE_REQUEST, message.number, len(request)), memoryview(request)
+        case SceneBytes():
+            payload = np.ascontiguousarray(message.data).data
+            return header(Kind.SCENE_BYTES, message.number, len(payload)), payload
 
 
 Bytes = bytes | bytearray | memoryview
@@ -149,6 +212,41 @@ def decode_render_points(frame: int, payload: Bytes) -> RenderPoints:
     if len(payload) % RENDER_POINT.itemsize:
         raise MessageError(f"render-points: found {len(payload)} bytes, expected a multiple of {RENDER_POINT.itemsize}")
     return RenderPoints(frame, np.frombuffer(payload, RENDER_POINT))
+
+
+def decode_scene_offer(payload: Bytes, source: Path) -> SceneOffer:
+    """The offer of a payload; ``source`` is what errors call the scene. Raises MessageError for anything else."""
+    colour, newline, text = bytes(payload).partition(b"\n")
+    if not newline or len(colour) > _MAX_COLOUR_BYTES or not colour.isascii():
+        raise MessageError(f"SCENE_OFFER message: found {colour[:40]!r}, expected a colour mode and a line feed")
+    try:
+        return SceneOffer(info_from_json(text, source), colour.decode("ascii"))
+    except StoreError as error:
+        raise MessageError(str(error)) from None
+
+
+def decode_scene_request(number: int, payload: Bytes, info: SceneInfo) -> SceneRequest:
+    """The request of a payload. Raises MessageError unless the scene has what it asks for."""
+    if not len(payload):
+        return SceneRequest(number, 0, 0, 0)
+    _expect(Kind.SCENE_REQUEST, len(payload), _SCENE_REQUEST.size)
+    array, n_bytes, first = _SCENE_REQUEST.unpack(payload)
+    if array >= len(info.arrays):
+        raise MessageError(f"SCENE_REQUEST message: found array {array}, expected one of {len(info.arrays)}")
+    size = list(info.arrays.values())[array].bytes
+    if not 0 < n_bytes <= SCENE_PIECE_BYTES or first > size - n_bytes:
+        raise MessageError(
+            f"SCENE_REQUEST message: found {n_bytes} bytes from {first}, expected 1 to {SCENE_PIECE_BYTES} of {size}"
+        )
+    return SceneRequest(number, array, first, n_bytes)
+
+
+def decode_scene_bytes(number: int, payload: Bytes, request: SceneRequest) -> SceneBytes:
+    """The bytes of a payload, a view of it. Raises MessageError unless it answers the request."""
+    if number != request.number:
+        raise MessageError(f"SCENE_BYTES message: found the reply to request {number}, expected {request.number}")
+    _expect(Kind.SCENE_BYTES, len(payload), request.n_bytes)
+    return SceneBytes(number, np.frombuffer(payload, np.uint8))
 
 
 def _expect(kind: Kind, found: int, expected: int) -> None:
