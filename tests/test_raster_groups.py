@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from splatpipe.nodes.raster import PointSize, ResidentPoints
 from splatpipe.nodes.raster.blocks import frustum
-from splatpipe.nodes.raster.groups import INSIDE_PX, NOT_INSIDE, OUTSIDE, draw_groups, group_cells, outcodes
+from splatpipe.nodes.raster.groups import INSIDE_PX, NOT_INSIDE, OUTSIDE, draw_groups, group_cell, group_cells, outcodes
 from splatpipe.nodes.raster.groups_reference import project_groups
 from splatpipe.nodes.raster.kernels import BATCH, RUN, View, pitch_of
 from splatpipe.nodes.raster.reference import reference_frame
@@ -38,7 +38,8 @@ def scene(n=4000, bits=10, epsilon=6.0, shift=0.0):
     cells = [encoded[0][0], LinearGroupCodec(epsilon).group(np.empty((0, 3), int), bits)[0], encoded[1][0]]
     origin = np.array([[0.0, 0, 0], [0, 0, 1], [1, 0, 0]]) + shift
     colour = np.random.default_rng(5).integers(0, 2**32, 2 * n, np.uint32)
-    return cells, group_cells(cells, origin, np.full(3, 2.0**-bits), np.zeros(3), colour)
+    colours = np.split(colour, np.cumsum([len(cell) for cell in cells])[:-1])
+    return cells, group_cells([group_cell(c, o, 2.0**-bits, k) for c, o, k in zip(cells, origin, colours, strict=True)])
 
 
 def draw(groups, camera, size=ONE_PIXEL, cells=None, turns=1):
@@ -148,7 +149,7 @@ def test_runs_hold_as_many_partitions_as_fit():
 def test_grid_points_of_more_bits_than_are_drawn():
     cell = LinearGroupCodec(1.0).group(np.array([[0, 0, 1 << 16]]), 17)[0]
     with pytest.raises(CodecError, match="at most 16 bits"):
-        group_cells([cell], np.zeros((1, 3)), np.ones(1), np.zeros(1), np.zeros(1, np.uint32))
+        group_cell(cell, np.zeros(3), 1.0, np.zeros(1, np.uint32))
 
 
 finite = st.floats(-1e3, 1e3, width=32)

@@ -12,7 +12,8 @@ import numpy as np
 from ...nodes.raster import PointSize, ResidentPoints
 from ...nodes.raster.cpu import CpuRasterizer
 from ...nodes.raster.framebuffers import FramebufferRasterizer
-from ...nodes.raster.groups import draw_groups, group_cells
+from ...nodes.raster.group_raster import CpuGroupRasterizer, ResidentGroups
+from ...nodes.raster.groups import group_cell, group_cells
 from ...nodes.raster.pools import PoolCell, draw_pools, pool_cells
 from ...shared.camera import Camera
 from ...shared.codecs import linear_groups, streams
@@ -62,15 +63,14 @@ def groups_frame(
     cells: Sequence[Cell], data: Sequence[np.ndarray], orders: Sequence[np.ndarray], camera: Camera, bits: int
 ) -> Iterator[Draw]:
     """From the bytes of ``codecs.linear_groups``."""
-    held = group_cells(
-        [linear_groups.read(coded, bits, len(order)) for coded, order in zip(data, orders, strict=True)],
-        np.array([cell.lower for cell in cells]),
-        np.array([cell.edge / 2**bits for cell in cells]),
-        np.zeros(len(cells)),
-        np.concatenate([cell.colour[order] for cell, order in zip(cells, orders, strict=True)]),
-    )
-    with _CellRasterizer(draw_groups, held, len(cells), sum(map(len, orders)), camera) as rasterizer:
-        yield rasterizer.draw
+    held = [
+        group_cell(linear_groups.read(coded, bits, len(order)), cell.lower, cell.edge / 2**bits, cell.colour[order])
+        for cell, coded, order in zip(cells, data, orders, strict=True)
+    ]
+    points = ResidentGroups(group_cells(held), np.cumsum([0, *map(len, orders)], dtype=np.int64))
+    everything = np.array([(0, len(points), 1)], RENDER_POINT)
+    with CpuGroupRasterizer(points, camera.width, camera.height) as rasterizer:
+        yield lambda: rasterizer.draw(camera, everything)
 
 
 class _CellRasterizer(FramebufferRasterizer):

@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol, Self
+from typing import TYPE_CHECKING, Protocol, Self
 
 import numpy as np
 
 from ...shared.camera import Camera
 from ...shared.errors import InputError, MessageError
+
+if TYPE_CHECKING:
+    from .group_raster import ResidentGroups
 
 MAX_SIDE_PX = 1 << 15
 """Largest side of a point's square, and of the viewport of ``cpu``: pixel indices stay within int32."""
@@ -161,7 +164,7 @@ def pixel_from_blocks(camera: Camera, block_origin: np.ndarray) -> np.ndarray:
     return out.astype(np.float32)
 
 
-def world_sides(points: ResidentPoints, size: PointSize) -> np.ndarray:
+def world_sides(points: ResidentPoints | ResidentGroups, size: PointSize) -> np.ndarray:
     """(b,) float64: side of a point's square in each block, world units; 0: the smallest.
 
     Raises InputError if sizes are adaptive and nobody knows the spacing of the points.

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from ...shared.errors import ConfigError
 from . import PointSize, Rasterizer, ResidentPoints, SplatSettings
 
+if TYPE_CHECKING:
+    from .group_raster import ResidentGroups
+
 RASTERIZERS = ("auto", "cpu", "gl", "gl-points")
+DRAW_POOLS = ("cpu",)
 
 
 def make_rasterizer(
     name: str,
-    points: ResidentPoints,
+    points: ResidentPoints | ResidentGroups,
     width: int,
     height: int,
     size: PointSize,
@@ -19,7 +25,7 @@ def make_rasterizer(
     splats: SplatSettings | None = None,
     compact: bool = False,
 ) -> Rasterizer:
-    """A rasterizer over ``points``; the caller closes it (it is a context manager).
+    """A rasterizer over ``points``; the caller closes it (it is a context manager). Linear groups are drawn by ``cpu``.
 
     name : one of ``RASTERIZERS``. ``auto`` takes ``gl`` where a GPU draws it and ``cpu`` elsewhere: OpenGL in software
         is slower than the compiled kernels.
@@ -29,6 +35,11 @@ def make_rasterizer(
     Raises ConfigError for another name or a style that it does not draw, DeviceError if OpenGL is asked for and not
     there.
     """
+    if not isinstance(points, ResidentPoints):
+        from .group_raster import CpuGroupRasterizer
+
+        check_style(name, splats, groups=True)
+        return CpuGroupRasterizer(points, width, height, size, threads)
     check_style(name, splats)
     match resolve_rasterizer(name), splats:
         case "cpu", None:
@@ -54,10 +65,19 @@ def make_rasterizer(
     raise ConfigError(f"render.rasterizer = {name!r}, expected one of {', '.join(RASTERIZERS)}")
 
 
-def check_style(name: str, splats: SplatSettings | None) -> None:
-    """Raise ConfigError if the rasterizer of this name does not draw splats and is to."""
+def check_style(name: str, splats: SplatSettings | None, *, groups: bool = False) -> None:
+    """Raise ConfigError if the rasterizer of this name does not draw splats, or linear groups, and is to."""
+    if groups and splats:
+        raise ConfigError("render.positions = 'coded': found render.style = 'splats', expected points")
+    if groups and name not in ("auto", "cpu"):
+        raise ConfigError(f"render.positions = 'coded': found render.rasterizer = {name!r}, expected auto or cpu")
     if name == "gl-points" and splats:
         raise ConfigError("render.rasterizer = 'gl-points' draws no splats, expected auto, cpu or gl")
+
+
+def draws_pools(name: str, splats: SplatSettings | None) -> bool:
+    """Whether the rasterizer of this name draws pooled points."""
+    return splats is None and resolve_rasterizer(name) in DRAW_POOLS
 
 
 def resolve_rasterizer(name: str) -> str:

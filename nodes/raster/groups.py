@@ -19,7 +19,8 @@ Source: Dinerstein, Egbert, Flann, "Linear Grouping", section 2.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -82,69 +83,85 @@ class GroupCells(NamedTuple):
         return sum(array.nbytes for array in arrays)
 
 
-def group_cells(
-    cells: Sequence[LinearGroups],
-    origin: np.ndarray,
-    step: np.ndarray,
-    world_side: np.ndarray,
-    colour: np.ndarray,
-) -> GroupCells:
-    """Cells put together. Arrays as of ``GroupCells``; ``colour`` in coded order, cell after cell.
+@dataclass(frozen=True)
+class GroupCell:
+    """A cell in this form; arrays as of ``GroupCells``.
+
+    origin : (3,) float64.  first : (r + 1, 3) int64, first kept point, group and inner point of each run.
+    kept : (3, k) uint16.  ends : (2, g) uint16.
+    """
+
+    origin: np.ndarray
+    step: float
+    first: np.ndarray
+    kept: np.ndarray
+    kept_colour: np.ndarray
+    ends: np.ndarray
+    n_inner: np.ndarray
+    parameter: np.ndarray
+    inner_colour: np.ndarray
+
+
+def group_cell(points: LinearGroups, origin: np.ndarray, step: float, colour: np.ndarray) -> GroupCell:
+    """A cell of linear groups.  colour : (n,) uint32 words in coded order.
 
     The groups of a run stand by size: loops of the same length one after the other are predicted (measured: half the
     time of interpolating).
     Raises CodecError for grid points of more than 16 bits an axis.
     """
-    kept = _joined([cell.kept for cell in cells], np.empty((0, 3), np.uint32))
-    if kept.max(initial=0) >> 16:
+    if points.kept.max(initial=0) >> 16:
         raise CodecError(
-            f"linear groups: found grid points up to {kept.max()}, expected at most 16 bits an axis to draw"
+            f"linear groups: found grid points up to {points.kept.max()}, expected at most 16 bits an axis to draw"
         )
-    first_run, runs, ends, sizes, parameters, kept_colours, inner_colours = [0], [], [], [], [], [], []
-    at = np.zeros(4, np.int64)
-    for cell in cells:
-        starts = _runs(cell.first_kept)
-        first_kept, first_group = cell.first_kept[starts], cell.first_group[starts]
-        first = np.column_stack([first_kept, first_group, cell.first_inner[first_group]])
-        runs.append(first[:-1] + at[:3])
-        first_run.append(first_run[-1] + len(first) - 1)
-        n_groups, n_inner = np.diff(first_group), np.diff(cell.first_inner)
-        by_size = np.lexsort((n_inner, np.repeat(np.arange(len(n_groups)), n_groups)))
-        ends.append((cell.ends - np.repeat(first_kept[:-1], n_groups)[:, None])[by_size])
-        sizes.append(n_inner[by_size])
-        of_kept, of_inner = np.split(colour[at[3] : at[3] + len(cell)], [len(cell.kept)])
-        kept_colours.append(of_kept)
-        inner_colours.append(gather_runs(of_inner, cell.first_inner, n_inner, by_size))
-        parameters.append(gather_runs(cell.parameter, cell.first_inner, n_inner, by_size))
-        at += [*first[-1], len(cell)]
-    table = _joined([*runs, at[None, :3]], np.empty((0, 3), np.int64))
-    both_ends = _joined(ends, np.empty((0, 2), np.int64)).astype(np.uint16)
-    none = np.empty(0, np.int64)
-    first_kept, first_group, first_inner = map(np.ascontiguousarray, table.T)
-    x, y, z = (np.ascontiguousarray(column, np.uint16) for column in kept.T)
-    v1, v2 = map(np.ascontiguousarray, both_ends.T)
-    return GroupCells(
-        np.ascontiguousarray(origin, np.float64),
-        np.ascontiguousarray(step, np.float64),
-        np.ascontiguousarray(world_side, np.float64),
-        np.array(first_run, np.int64),
-        first_kept,
-        first_group,
-        first_inner,
-        x,
-        y,
-        z,
-        _joined(kept_colours, none).astype(np.uint32),
-        v1,
-        v2,
-        _joined(sizes, none).astype(np.uint16),
-        _joined(parameters, np.empty(0, np.uint8)),
-        _joined(inner_colours, none).astype(np.uint32),
+    starts = _runs(points.first_kept)
+    first_kept, first_group = points.first_kept[starts], points.first_group[starts]
+    n_groups, n_inner = np.diff(first_group), np.diff(points.first_inner)
+    by_size = np.lexsort((n_inner, np.repeat(np.arange(len(n_groups)), n_groups)))
+    ends = points.ends - np.repeat(first_kept[:-1], n_groups)[:, None]
+    kept_colour, inner_colour = np.split(np.asarray(colour, np.uint32), [len(points.kept)])
+    return GroupCell(
+        origin,
+        step,
+        np.column_stack([first_kept, first_group, points.first_inner[first_group]]),
+        points.kept.T.astype(np.uint16),
+        kept_colour,
+        ends[by_size].T.astype(np.uint16),
+        n_inner[by_size].astype(np.uint16),
+        gather_runs(points.parameter, points.first_inner, n_inner, by_size),
+        gather_runs(inner_colour, points.first_inner, n_inner, by_size),
     )
 
 
-def _joined(arrays: Sequence[np.ndarray], empty: np.ndarray) -> np.ndarray:
-    return np.concatenate([empty, *arrays])
+def group_cells(cells: Sequence[GroupCell]) -> GroupCells:
+    """Cells put together, with a ``world_side`` of 0. Cost: a copy of their arrays."""
+
+    def joined(dtype: type, arrays: Iterable[np.ndarray]) -> np.ndarray:
+        return np.concatenate([np.empty(0, dtype), *arrays])
+
+    sizes = np.array([cell.first[-1] for cell in cells], np.int64).reshape(-1, 3)
+    ends = np.cumsum(sizes, axis=0)
+    tables = [cell.first[:-1] + before for cell, before in zip(cells, ends - sizes, strict=True)]
+    first_kept, first_group, first_inner = np.concatenate([*tables, sizes.sum(axis=0)[None]]).T
+    x, y, z = (joined(np.uint16, (cell.kept[axis] for cell in cells)) for axis in range(3))
+    v1, v2 = (joined(np.uint16, (cell.ends[end] for cell in cells)) for end in range(2))
+    return GroupCells(
+        origin=np.array([cell.origin for cell in cells], np.float64).reshape(-1, 3),
+        step=np.array([cell.step for cell in cells], np.float64),
+        world_side=np.zeros(len(cells)),
+        first_run=np.cumsum([0, *(len(cell.first) - 1 for cell in cells)], dtype=np.int64),
+        first_kept=np.ascontiguousarray(first_kept),
+        first_group=np.ascontiguousarray(first_group),
+        first_inner=np.ascontiguousarray(first_inner),
+        x=x,
+        y=y,
+        z=z,
+        kept_colour=joined(np.uint32, (cell.kept_colour for cell in cells)),
+        v1=v1,
+        v2=v2,
+        n_inner=joined(np.uint16, (cell.n_inner for cell in cells)),
+        parameter=joined(np.uint8, (cell.parameter for cell in cells)),
+        inner_colour=joined(np.uint32, (cell.inner_colour for cell in cells)),
+    )
 
 
 def _runs(first_kept: np.ndarray) -> np.ndarray:

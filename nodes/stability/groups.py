@@ -8,7 +8,7 @@ from ...shared.camera import look_at, perspective_camera
 from ...shared.codecs.linear_groups import LinearGroupCodec
 from ...shared.stability.case import cases, expect
 from ..raster import ResidentPoints
-from ..raster.groups import group_cells
+from ..raster.groups import group_cell, group_cells
 from ..raster.groups_reference import project_groups
 
 _VIEWS = {
@@ -32,7 +32,7 @@ def image_position(name: str) -> float:
     cell, _ = LinearGroupCodec(100.0).group((sheet * 2**16).astype(np.int64), 16)
     expect(len(cell.parameter) > 1000, "many points are grouped")
     none = np.zeros(len(cell), np.uint32)
-    groups = group_cells([cell], np.full((1, 3), shift), np.array([edge / 2**16]), np.zeros(1), none)
+    groups = group_cells([group_cell(cell, np.full(3, shift), edge / 2**16, none)])
     pose = look_at(np.array(eye) * edge + shift, np.array([0.5, 0.5, 0.5]) * edge + shift, np.array([0.0, 0.0, 1.0]))
     camera = perspective_camera(
         frame=0, world_from_camera=pose, fov_y_rad=0.9, width=1920, height=1080, near=0.01 * edge
