@@ -104,7 +104,7 @@ class Colouring:
         if value_range is not None and not (all(map(math.isfinite, value_range)) and value_range[0] != value_range[1]):
             raise ConfigError(f"render.colour_range = {list(value_range)}, expected two different numbers")
         if mode in _COLOUR_MAPPED:
-            _colormap(colormap)
+            colormap_words(colormap)
         return cls(mode, attribute, colormap, value_range, word, _class_colours(class_colours))
 
     def settled(self, scene: Scene) -> Colouring:
@@ -137,7 +137,7 @@ def colour_words(scene: Scene, colouring: Colouring) -> np.ndarray:
         case mode:
             values = _scalars(scene, mode)
             low, high = colouring.value_range or _robust_range(values, n)
-            table = _colormap(colouring.colormap)
+            table = colormap_words(colouring.colormap)
             return _by_chunk(n, lambda part: map_scalars(values(part), low, high, table))
 
 
@@ -291,7 +291,7 @@ def _class_palette(colours: Mapping[int, str]) -> np.ndarray:
     return rgba.view("<u4").ravel()
 
 
-def _colormap(name: str) -> np.ndarray:
+def colormap_words(name: str) -> np.ndarray:
     """(256,) uint32 words of a matplotlib colour map. Raises ConfigError with near names for an unknown one."""
     from matplotlib import colormaps
 

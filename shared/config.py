@@ -127,6 +127,17 @@ class SplatSection(Section):
     lighting: bool = True
 
 
+class LayerSection(Section):
+    """One ``[[layers]]``: a layer to draw besides the points."""
+
+    path: str
+    technique: Literal["avc", "triangles", "strips", "instancing"] = "avc"
+    detail_px: Annotated[float, Field(ge=0, le=4096)] = 0.0
+    colormap: str = "viridis"
+    value_range: tuple[float, float] | None = None
+    value_filter: tuple[float, float] | None = None
+
+
 class PipelineSection(Section):
     """``[pipeline]``."""
 
@@ -158,6 +169,7 @@ class RunConfig(Section):
     sampling: SamplingSection = SamplingSection()
     render: RenderSection = RenderSection()
     splats: SplatSection = SplatSection()
+    layers: list[LayerSection] = []
     pipeline: PipelineSection = PipelineSection()
     output: OutputSection = OutputSection()
 
@@ -187,6 +199,9 @@ def read_config(path: Path | str) -> dict[str, Any]:
         value = data.get(section, {}).get(key) if isinstance(data.get(section), dict) else None
         if isinstance(value, str) and value:
             data[section][key] = str(Path(path).parent / value)
+    for layer in data.get("layers", []) if isinstance(data.get("layers"), list) else []:
+        if isinstance(layer, dict) and isinstance(layer.get("path"), str) and layer["path"]:
+            layer["path"] = str(Path(path).parent / layer["path"])
     return data
 
 

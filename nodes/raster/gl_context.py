@@ -45,6 +45,13 @@ def gl_available() -> tuple[bool, str]:
     return False, (probe.stderr.strip().splitlines() or ["OpenGL: the probe failed"])[-1]
 
 
+def require_gl(what: str) -> None:
+    """Raise DeviceError, naming ``what`` needs it and what to install, where the default EGL device does not draw."""
+    available, why = gl_available()
+    if not available:
+        raise DeviceError(f"{what}: {why}")
+
+
 def is_software(renderer: str) -> bool:
     """Whether a renderer string names a driver that draws on the CPU."""
     return any(name in renderer.lower() for name in ("llvmpipe", "softpipe", "swrast"))

@@ -1,0 +1,94 @@
+"""The framebuffer that layers are drawn to, and its words.
+
+A fragment is a framebuffer word, its colour and the bits of its depth, so a layer is composited with points, whoever
+drew those, by the minimum of words.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+
+from ...shared.camera import Camera
+from ...shared.errors import DeviceError, InputError
+from ...shared.layers.layer import Layer
+from ...shared.messages import FRAMEBUFFER_EMPTY
+from ..raster.gl_context import check_errors, open_context
+
+if TYPE_CHECKING:
+    from ...shared.config import LayerSection
+    from .gl_layer import GlLayer
+
+
+class GlLayers:
+    """Draws layers; a context manager that owns their OpenGL context.
+
+    layers, settings : what to draw and how, one each.  width, height : of the frames, pixels.
+    device_index : in EGL's order; GLCONTEXT_DEVICE_INDEX wins.
+    Raises DeviceError: no OpenGL 4.5, or not enough memory; InputError: the viewport is above the texture size.
+    To be used from the thread that made it.
+    """
+
+    def __init__(
+        self, layers: Sequence[Layer], settings: Sequence[LayerSection], width: int, height: int, device_index: int = 0
+    ) -> None:
+        import moderngl
+
+        from .gl_kinds import gl_layer
+
+        self._context = open_context(device_index)
+        try:
+            self.device = str(self._context.info["GL_RENDERER"])
+            most = self._context.info["GL_MAX_TEXTURE_SIZE"]
+            if not (1 <= width <= most and 1 <= height <= most):
+                raise InputError(f"viewport: found {width}×{height}, expected 1…{most} px a side")
+            self._image = np.full((height, width), FRAMEBUFFER_EMPTY)
+            self._empty = self._image.copy()
+            self._words = self._context.texture((width, height), 2, dtype="u4")
+            depth = self._context.depth_texture((width, height))
+            self._framebuffer = self._context.framebuffer([self._words], depth)
+            self._depth_only = self._context.framebuffer(
+                depth_attachment=depth
+            )  # clearing integer colours is undefined
+            self._context.enable_only(moderngl.DEPTH_TEST)
+            self._layers: list[GlLayer] = [
+                gl_layer(self._context, layer, setting) for layer, setting in zip(layers, settings, strict=True)
+            ]
+            check_errors(self._context, "setting up layers")
+        except moderngl.Error as error:
+            self.close()
+            raise DeviceError(f"OpenGL: {' '.join(str(error).split())}") from error
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __len__(self) -> int:
+        return len(self._layers)
+
+    def close(self) -> None:
+        """Release the context and with it all device memory."""
+        self._context.release()
+
+    def draw(self, camera: Camera, entries: Sequence[np.ndarray]) -> np.ndarray:
+        """(height, width) uint64 framebuffer words; valid until the next call.
+
+        entries : (m,) RENDER_POINT of each layer, counting objects; stride 1.
+        Raises MessageError for an entry beyond the objects, DeviceError for an OpenGL error.
+        """
+        with self._context:
+            self._words.write(self._empty)
+            self._depth_only.clear(depth=1.0)
+            self._framebuffer.use()
+            for layer, chosen in zip(self._layers, entries, strict=True):
+                layer.draw(camera, chosen)
+            self._words.read_into(self._image)
+            check_errors(self._context, "drawing layers")
+        return self._image

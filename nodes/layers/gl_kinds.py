@@ -1,0 +1,38 @@
+"""Which class draws a kind with a technique. Imports what a run draws, nothing else."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ...shared.errors import ConfigError
+
+if TYPE_CHECKING:
+    import moderngl
+
+    from ...shared.config import LayerSection
+    from ...shared.layers.layer import Layer
+    from .gl_layer import GlLayer
+
+TECHNIQUES = ("avc", "triangles", "strips", "instancing")
+
+
+def gl_layer(context: moderngl.Context, layer: Layer, settings: LayerSection) -> GlLayer:
+    """The layer on the device. Raises ConfigError for a kind or technique that does not exist."""
+    technique = settings.technique
+    match layer.kind, technique:
+        case "cuboids", "avc":
+            from .gl_cuboids import GlCuboids
+
+            return GlCuboids(context, layer, settings)
+        case "cuboids", "instancing":
+            from .gl_cuboids import GlCuboidInstances
+
+            return GlCuboidInstances(context, layer, settings)
+        case "cuboids", "triangles" | "strips":
+            from .expand_cuboids import strips
+            from .gl_mesh import GlMesh
+            from .mesh import separate
+
+            mesh = strips(layer)
+            return GlMesh(context, layer, settings, separate(mesh) if technique == "triangles" else mesh)
+    raise ConfigError(f"layer {layer.name}: technique {technique!r} of {layer.kind}: not found")
