@@ -8,6 +8,7 @@ ranks that work (measured: two working ranks of four on two cores lost half thei
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections import defaultdict, deque
 from typing import Any, NamedTuple
@@ -66,14 +67,16 @@ class Transport:
         payload = memoryview(json.dumps(note).encode() if note is not None else b"")
         self._post(dest, header(kind, frame, len(payload)), payload)
 
-    def receive(self, source: int, expected: Kind, max_bytes: int) -> Received:
+    def receive(self, source: int, expected: Kind, max_bytes: int, *, patient: bool = False) -> Received:
         """The next message of kind ``expected`` from a rank; polite while it waits.
 
+        patient : wait for it however long it takes, as for a rank that is loading a scene.
         Raises MessageError for a foreign header or a payload above ``max_bytes`` (nothing is allocated for it),
         SplatpipeError after ``timeout_s``.
         """
         head = bytearray(HEADER.size)
-        self._wait([self._comm.Irecv([head, self._mpi.BYTE], source, int(expected))], source, expected.name)
+        request = self._comm.Irecv([head, self._mpi.BYTE], source, int(expected))
+        self._wait([request], source, expected.name, math.inf if patient else self.timeout_s)
         kind, frame, length = parse_header(bytes(head))
         if kind is not expected:
             raise MessageError(f"from rank {source}: found {kind.name}, expected {expected.name}")
@@ -81,7 +84,7 @@ class Transport:
             raise MessageError(f"{kind.name} from rank {source}: found {length} bytes, expected at most {max_bytes}")
         payload = np.empty(length, np.uint8)
         requests = [self._comm.Irecv([piece, self._mpi.BYTE], source, int(expected)) for piece in self._pieces(payload)]
-        self._wait(requests, source, expected.name)
+        self._wait(requests, source, expected.name, self.timeout_s)
         return Received(frame, payload.data)
 
     def receive_note(self, source: int, expected: Kind) -> tuple[int, dict[str, Any]]:
@@ -99,9 +102,11 @@ class Transport:
         """Whether a message of a kind waits to be received. Cost: one probe."""
         return bool(self._comm.Iprobe(source, int(kind)))
 
-    def agree(self, status: int) -> int:
-        """The highest status of all ranks. Collective."""
-        return int(self._comm.allreduce(status, op=self._mpi.MAX))
+    def agree(self, status: int) -> list[int]:
+        """The status of every rank. Collective."""
+        statuses = np.empty(self.size, np.int32)
+        self._comm.Allgather(np.array([status], np.int32), statuses)
+        return statuses.tolist()
 
     def bounce(self, peer: int, payload: np.ndarray, *, serve: bool) -> None:
         """Send an (n,) uint8 payload to a rank and take it back, or the other way round, with MPI's own blocking calls.
@@ -154,10 +159,10 @@ class Transport:
         while queue and self._mpi.Request.Testall(queue[0][0]):
             queue.popleft()
         while len(queue) > at_most:
-            self._wait(queue[0][0], dest, "a message sent to it to be taken")
+            self._wait(queue[0][0], dest, "a message sent to it to be taken", self.timeout_s)
             queue.popleft()
 
-    def _wait(self, requests: list[Any], peer: int, what: str) -> None:
+    def _wait(self, requests: list[Any], peer: int, what: str, timeout_s: float) -> None:
         testall = self._mpi.Request.Testall
         for _ in range(_SPINS):
             if testall(requests):
@@ -165,6 +170,6 @@ class Transport:
         started = time.monotonic()
         while not testall(requests):
             waited_s = time.monotonic() - started
-            if waited_s > self.timeout_s:
-                raise SplatpipeError(f"waited {self.timeout_s:g} s for rank {peer}: {what}")
+            if waited_s > timeout_s:
+                raise SplatpipeError(f"waited {timeout_s:g} s for rank {peer}: {what}")
             time.sleep(min(max(waited_s * _SLEEP_SHARE, _SLEEP_S[0]), _SLEEP_S[1]))
