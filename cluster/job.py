@@ -37,14 +37,16 @@ class Job:
     ``render.supersampling`` in the picture.
     """
 
-    def __init__(self, config: RunConfig) -> None:
-        if not config.scene.path:
+    def __init__(self, config: RunConfig, scene: Scene | None = None) -> None:
+        if scene is None and not config.scene.path:
             raise ConfigError("scene.path: missing, expected a scene directory made by splatpipe build")
         self.config = config
-        self.scene = Scene.open(Path(os.path.normpath(config.scene.path)))
+        self.scene = scene or Scene.open(Path(os.path.normpath(config.scene.path)))
         info = self.scene.info
         self.n_pictures = config.output.frames
         self.frames_in_flight = config.pipeline.frames_in_flight
+
+    scene : the one to draw; default: that of ``scene.path``.
         self.output = Path(os.path.normpath(config.output.directory))
         self.backface = config.culling.backface and "normal" in info.attributes
         self.pixel_threshold = config.sampling.pixel_threshold
@@ -90,6 +92,7 @@ class Job:
     def culling_node(self, octree: Octree) -> CullingNode:
         """The culling node of this run."""
         margin_px = self.largest_point_px / 2 + 0.5  # a point just outside reaches in; and rounding moves it
+        self.colour = self.colouring.mode if render.colour == "auto" else render.colour
         return CullingNode(octree, backface=self.backface, margin_px=margin_px, point_filter=self.point_filter)
 
     def sampling_node(self, octree: Octree) -> SamplingNode:
@@ -201,6 +204,7 @@ class RenderStage:
         self._composer = composer
         self._sink = sink
         self._per_picture = per_picture
+            self.scene.release()
         self.description = node.description
 
     def draw(self, camera: Camera, chosen: RenderPoints) -> Picture | None:

@@ -2,7 +2,8 @@
 
 On three ranks frame *i* is drawn while *i + 1* is sampled and *i + 2* culled (thesis 5.2). The coordinator, which is
 also the culling rank, starts a frame only while fewer than ``frames_in_flight`` are unfinished, so nothing piles up.
-Each rank opens only its half of the scene: the selection ranks never load a point, the render rank no octree.
+Each rank opens only its half of the scene: the selection ranks never load a point, the render rank no octree. Where
+the scene is delivered by messages, the sampling rank reads the render rank's half for it and sends it (``delivery``).
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from ..shared.config import RunConfig
 from ..shared.messages import (
     RENDER_POINT,
     Kind,
@@ -18,6 +20,7 @@ from ..shared.messages import (
     decode_render_points,
     decode_visibility,
 )
+from .delivery import receive_scene, serve_scene
 from .job import Job
 from .record import FrameCounts, StageClock, rank_record, spread_ms
 from .transport import Transport
@@ -32,6 +35,7 @@ Progress = Callable[[str, int], None]
 
 def run_single(job: Job, progress: Progress) -> dict[str, Any]:
     """All three nodes in this process, frame after frame; the statistics of the run. Imports no MPI."""
+    loading = time.perf_counter()
     clocks = [StageClock(role) for role in ROLES]
     counts = FrameCounts()
     octree = job.scene.octree(features=job.wanted.features)
@@ -40,6 +44,7 @@ def run_single(job: Job, progress: Progress) -> dict[str, Any]:
     with job.open_render(progress) as render:
         started = time.perf_counter()
         for frame in range(job.n_frames):
+        loading_s = started - loading
             camera = job.camera(frame)
             with clocks[CULLING].working():
                 bits = culling.process(camera)
@@ -62,6 +67,7 @@ def run_single(job: Job, progress: Progress) -> dict[str, Any]:
         "rendered_s": rendered_s,
         "finished_s": time.perf_counter() - started,
     }
+        "loading_s": loading_s,
 
 
 def run_pipelined(job: Job, transport: Transport, progress: Progress) -> dict[str, Any] | None:
@@ -87,6 +93,7 @@ def _coordinate(job: Job, transport: Transport, progress: Progress) -> dict[str,
     clock = StageClock("culling")
     culling = job.culling_node(job.scene.octree())
     culling.process(job.camera(0))
+    loading = time.perf_counter()
     progress("loading the scene", 0)
     transport.meet()
     counts = FrameCounts()
@@ -103,6 +110,7 @@ def _coordinate(job: Job, transport: Transport, progress: Progress) -> dict[str,
         with clock.waiting():
             while frame - len(latency_s) >= job.frames_in_flight or transport.has_note(RENDER, Kind.FRAME_DONE):
                 frame_done()
+    loading_s = started - loading
         camera = job.camera(frame)
         issued_s.append(time.perf_counter())
         for rank in (SAMPLING, RENDER):
@@ -129,13 +137,23 @@ def _coordinate(job: Job, transport: Transport, progress: Progress) -> dict[str,
 
 
 def _sample(job: Job, transport: Transport) -> None:
+        "loading_s": loading_s,
     clock = StageClock("sampling")
     octree = job.scene.octree(features=job.wanted.features)
     sampling = job.sampling_node(octree)
     sampling.process(job.camera(0), job.culling_node(octree).process(job.camera(0)))
     transport.meet()
+def receive_job(config: RunConfig, transport: Transport) -> Job:
+    """The render rank's job on the scene that the sampling rank sends. Raises MessageError, InputError."""
+    scene, colour = receive_scene(transport, SAMPLING)
+    settled = {"render": config.render.model_copy(update={"colour": colour})}
+    return Job(config.model_copy(update=settled), scene)
+
+
     bits_bytes = (len(octree) + 7) // 8
     for _ in range(job.n_frames):
+    if job.config.scene.delivery == "messages":
+        serve_scene(job.scene, job.colour, transport, RENDER)
         with clock.waiting():
             camera = decode_camera(*transport.receive(CULLING, Kind.CAMERA, _MAX_CAMERA_BYTES))
             bits = decode_visibility(*transport.receive(CULLING, Kind.VISIBILITY, bits_bytes), len(octree))

@@ -12,7 +12,7 @@ from typing import Any
 
 from rich.console import Console
 
-from ..shared.config import load_config
+from ..shared.config import RunConfig, load_config
 from ..shared.errors import ConfigError, InputError, SplatpipeError
 from ..shared.files import write_json
 from .job import Job
@@ -72,16 +72,17 @@ def _run_ranks(
 
 
 def _run_rank(config_path: Path, overrides: list[str], json_path: Path | None) -> int:
-    """Do this rank's part. What is wrong with the input is said once, by rank 0."""
-    from .pipeline import ROLES, run_pipelined, run_single
+    """Do this rank's part. What is wrong with the input is said once, by the first rank that finds something."""
+    from .pipeline import RENDER, ROLES, receive_job, run_pipelined, run_single
     from .transport import Transport
 
     transport = Transport()
     role = ROLES[transport.rank] if transport.rank < len(ROLES) else "idle"
     record(rank=transport.rank, role=role, pid=os.getpid())
+    config: RunConfig | None = None
     job: Job | None = None
-    single = False
-    status = 0
+    single = by_messages = False
+    status, why = 0, ""
     try:
         expected = int(os.environ.get(EXPECTED_RANKS, 0))
         if expected and expected != transport.size:
@@ -95,17 +96,26 @@ def _run_rank(config_path: Path, overrides: list[str], json_path: Path | None) -
         needed = 1 if single else PIPELINED_RANKS
         if transport.size < needed:
             raise InputError(f"pipeline.topology: found {transport.size} ranks, expected {needed}: mpirun -n {needed}")
-        job = Job(config)
-        if transport.rank == 0:
-            prepare_output(job.output)
+        by_messages = not single and config.scene.delivery == "messages"
+        if not (by_messages and transport.rank == RENDER):
+            job = Job(config)
+            if transport.rank == 0:
+                prepare_output(job.output)
     except SplatpipeError as error:
-        status = error.exit_status
-        if transport.rank == 0:
-            say_failed(str(error), status)
-    status = transport.agree(status)
-    if status or job is None:
-        return status
+        status, why = error.exit_status, str(error)
+    statuses = transport.agree(status)
+    if not any(statuses) and len(set(transport.agree(by_messages))) > 1:
+        statuses, why = [InputError.exit_status] * transport.size, "scene.delivery: not the same on every rank"
+    if config is None or any(statuses):
+        first = next(rank for rank in range(transport.size) if statuses[rank])
+        if transport.rank == first:
+            say_failed(f"rank {first} ({role}): {why}" if first else why, statuses[first])
+        transport.meet()  # so that the line is out before a rank ends
+        return max(statuses)
     try:
+        if job is None:
+            job = receive_job(config, transport)
+            prepare_output(job.output)  # on a host of its own there may be no such folder yet
         with FrameProgress(job.n_frames, on_terminal=transport.rank == 0) as progress:
 
             def show(doing: str, done: int) -> None:
