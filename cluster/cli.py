@@ -16,6 +16,7 @@ import typer
 from ..shared.compile_cache import ensure_compile_cache
 from ..shared.errors import InputError, SplatpipeError
 from ..shared.files import DISK_FULL
+from .layers import layer_app
 
 app = typer.Typer(
     name="splatpipe",
@@ -27,6 +28,7 @@ app = typer.Typer(
 )
 bench_app = typer.Typer(help="Measure this machine: rasterizers and the builder, beside others in the same run.")
 app.add_typer(bench_app, name="bench")
+app.add_typer(layer_app, name="layer")
 
 JsonOption = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write what was measured.")]
 

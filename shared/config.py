@@ -11,20 +11,16 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
 from .errors import ConfigError
+from .layer_config import LayerSection
+from .section import Section
 
 Vector = tuple[float, float, float]
 Matrix = list[list[float]]
 PositiveInt = Annotated[int, Field(ge=1)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-
-
-class Section(BaseModel):
-    """A table of a configuration file: unknown keys are refused, values checked and then fixed."""
-
-    model_config = ConfigDict(extra="forbid", strict=False, frozen=True, allow_inf_nan=False)
 
 
 AnySection = TypeVar("AnySection", bound=Section)
@@ -125,17 +121,6 @@ class SplatSection(Section):
     depth_offset: Annotated[float, Field(ge=0)] = 1.0
     features: bool = False
     lighting: bool = True
-
-
-class LayerSection(Section):
-    """One ``[[layers]]``: a layer to draw besides the points."""
-
-    path: str
-    technique: Literal["avc", "triangles", "strips", "instancing"] = "avc"
-    detail_px: Annotated[float, Field(ge=0, le=4096)] = 0.0
-    colormap: str = "viridis"
-    value_range: tuple[float, float] | None = None
-    value_filter: tuple[float, float] | None = None
 
 
 class PipelineSection(Section):

@@ -14,7 +14,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from ...shared.config import PositiveInt, RunConfig, Section, read_toml, validated
+from ...shared.config import PositiveInt, RunConfig, read_toml, validated
+from ...shared.section import Section
 from ...shared.errors import ConfigError
 
 SWEPT_SECTIONS = ("sampling", "render", "culling", "positions", "image")

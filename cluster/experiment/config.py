@@ -32,7 +32,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from ...shared.config import Section
+from ...shared.section import Section
 
 Values = Annotated[list[Any], Field(min_length=1)]
 

@@ -18,7 +18,7 @@ from ...shared.messages import FRAMEBUFFER_EMPTY
 from ..raster.gl_context import check_errors, open_context
 
 if TYPE_CHECKING:
-    from ...shared.config import LayerSection
+    from ...shared.layer_config import LayerSection
     from .gl_layer import GlLayer
 
 

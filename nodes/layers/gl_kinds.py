@@ -9,7 +9,7 @@ from ...shared.errors import ConfigError
 if TYPE_CHECKING:
     import moderngl
 
-    from ...shared.config import LayerSection
+    from ...shared.layer_config import LayerSection
     from ...shared.layers.layer import Layer
     from .gl_layer import GlLayer
 

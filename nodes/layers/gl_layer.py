@@ -15,7 +15,7 @@ from ..raster.pieces import check_entries
 if TYPE_CHECKING:
     import moderngl
 
-    from ...shared.config import LayerSection
+    from ...shared.layer_config import LayerSection
 
 COMMAND = np.dtype(
     {

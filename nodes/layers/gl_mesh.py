@@ -13,7 +13,7 @@ from .mesh import Mesh
 if TYPE_CHECKING:
     import moderngl
 
-    from ...shared.config import LayerSection
+    from ...shared.layer_config import LayerSection
     from ...shared.layers.layer import Layer
 
 VERTEX = np.dtype([("position", "<f4", 3), ("normal", "<f4", 3), ("value", "<f4")])

@@ -11,7 +11,7 @@ from .gl_layer import colour_table, set_uniform
 if TYPE_CHECKING:
     import moderngl
 
-    from ...shared.config import LayerSection
+    from ...shared.layer_config import LayerSection
 
 FLOAT_MAX = float(np.finfo(np.float32).max)
 

@@ -1,0 +1,10 @@
+"""``splatpipe layer KIND``: files → layers."""
+
+from __future__ import annotations
+
+import typer
+
+from .cuboids import cuboids
+
+layer_app = typer.Typer(help="Make a layer of objects to draw besides the points: buildings, tracks, treemaps.")
+layer_app.command("cuboids")(cuboids)

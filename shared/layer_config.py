@@ -1,0 +1,23 @@
+"""``[[layers]]`` of a configuration: which layers are drawn besides the points, and how.
+
+Nothing here is in the records on the device: changing it sends no record again.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from .section import Section
+
+
+class LayerSection(Section):
+    """One of ``[[layers]]``."""
+
+    path: str
+    technique: Literal["avc", "triangles", "strips", "instancing"] = "avc"
+    detail_px: Annotated[float, Field(ge=0, le=4096)] = 0.0
+    colormap: str = "viridis"
+    value_range: tuple[float, float] | None = None
+    value_filter: tuple[float, float] | None = None

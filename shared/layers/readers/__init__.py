@@ -1,0 +1,1 @@
+"""Readers of what layers are made from: outlines, tracks, tables, point clouds."""
