@@ -35,6 +35,8 @@ class Job:
     Frames are what the pipeline draws, views of pictures: ``n_frames`` of ``views.width`` × ``views.height`` pixels,
     ``views.per_picture`` to a picture. Sizes of points are in drawn pixels, so that they do not depend on
     ``render.supersampling`` in the picture.
+
+    scene : the one to draw; default: that of ``scene.path``.
     """
 
     def __init__(self, config: RunConfig, scene: Scene | None = None) -> None:
@@ -45,8 +47,6 @@ class Job:
         info = self.scene.info
         self.n_pictures = config.output.frames
         self.frames_in_flight = config.pipeline.frames_in_flight
-
-    scene : the one to draw; default: that of ``scene.path``.
         self.output = Path(os.path.normpath(config.output.directory))
         self.backface = config.culling.backface and "normal" in info.attributes
         self.pixel_threshold = config.sampling.pixel_threshold
@@ -72,6 +72,7 @@ class Job:
         self.colouring = Colouring.choose(
             self.scene, render.colour, render.colormap, render.colour_range, render.class_colours
         )
+        self.colour = self.colouring.mode if render.colour == "auto" else render.colour
         if self.splats and self.splats.lighting and self.colouring.mode == "normal":  # light falls on a splat once
             self.colouring = Colouring.choose(self.scene, SPLAT_COLOUR)
         self.views = camera_views(config.camera, info, self.n_pictures, render.supersampling)
@@ -92,7 +93,6 @@ class Job:
     def culling_node(self, octree: Octree) -> CullingNode:
         """The culling node of this run."""
         margin_px = self.largest_point_px / 2 + 0.5  # a point just outside reaches in; and rounding moves it
-        self.colour = self.colouring.mode if render.colour == "auto" else render.colour
         return CullingNode(octree, backface=self.backface, margin_px=margin_px, point_filter=self.point_filter)
 
     def sampling_node(self, octree: Octree) -> SamplingNode:
@@ -134,6 +134,7 @@ class Job:
         output = self.config.output
         with ExitStack() as stack:
             rasterizer = stack.enter_context(self.make_rasterizer(points))
+            self.scene.release()
             node = RenderNode(rasterizer)
             if rasterizer.name == "cpu" and not kernels_cached():
                 progress("compiling kernels (once; kept for the next run)", 0)
@@ -204,7 +205,6 @@ class RenderStage:
         self._composer = composer
         self._sink = sink
         self._per_picture = per_picture
-            self.scene.release()
         self.description = node.description
 
     def draw(self, camera: Camera, chosen: RenderPoints) -> Picture | None:

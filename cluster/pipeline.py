@@ -43,8 +43,8 @@ def run_single(job: Job, progress: Progress) -> dict[str, Any]:
     sampling.process(job.camera(0), culling.process(job.camera(0)))  # compiles, or loads what was compiled
     with job.open_render(progress) as render:
         started = time.perf_counter()
-        for frame in range(job.n_frames):
         loading_s = started - loading
+        for frame in range(job.n_frames):
             camera = job.camera(frame)
             with clocks[CULLING].working():
                 bits = culling.process(camera)
@@ -64,10 +64,10 @@ def run_single(job: Job, progress: Progress) -> dict[str, Any]:
         "messages": {},
         "latency_ms": spread_ms([sum(t) for t in zip(*(clock.work_s for clock in clocks), strict=True)]),
         "per_frame": {f"{clock.stage}_s": clock.work_s for clock in clocks} | counts.lists() | render.times(),
+        "loading_s": loading_s,
         "rendered_s": rendered_s,
         "finished_s": time.perf_counter() - started,
     }
-        "loading_s": loading_s,
 
 
 def run_pipelined(job: Job, transport: Transport, progress: Progress) -> dict[str, Any] | None:
@@ -90,10 +90,10 @@ def run_pipelined(job: Job, transport: Transport, progress: Progress) -> dict[st
 
 
 def _coordinate(job: Job, transport: Transport, progress: Progress) -> dict[str, Any]:
+    loading = time.perf_counter()
     clock = StageClock("culling")
     culling = job.culling_node(job.scene.octree())
     culling.process(job.camera(0))
-    loading = time.perf_counter()
     progress("loading the scene", 0)
     transport.meet()
     counts = FrameCounts()
@@ -106,11 +106,11 @@ def _coordinate(job: Job, transport: Transport, progress: Progress) -> dict[str,
         progress("rendering", frame + 1)
 
     started = time.perf_counter()
+    loading_s = started - loading
     for frame in range(job.n_frames):
         with clock.waiting():
             while frame - len(latency_s) >= job.frames_in_flight or transport.has_note(RENDER, Kind.FRAME_DONE):
                 frame_done()
-    loading_s = started - loading
         camera = job.camera(frame)
         issued_s.append(time.perf_counter())
         for rank in (SAMPLING, RENDER):
@@ -131,18 +131,12 @@ def _coordinate(job: Job, transport: Transport, progress: Progress) -> dict[str,
         "messages": {kind: count for rank in ranks for kind, count in rank["messages"].items()},
         "latency_ms": spread_ms(latency_s),
         "per_frame": {name: values for rank in ranks for name, values in rank["per_frame"].items()},
+        "loading_s": loading_s,
         "rendered_s": rendered_s,
         "finished_s": time.perf_counter() - started,
     }
 
 
-def _sample(job: Job, transport: Transport) -> None:
-        "loading_s": loading_s,
-    clock = StageClock("sampling")
-    octree = job.scene.octree(features=job.wanted.features)
-    sampling = job.sampling_node(octree)
-    sampling.process(job.camera(0), job.culling_node(octree).process(job.camera(0)))
-    transport.meet()
 def receive_job(config: RunConfig, transport: Transport) -> Job:
     """The render rank's job on the scene that the sampling rank sends. Raises MessageError, InputError."""
     scene, colour = receive_scene(transport, SAMPLING)
@@ -150,10 +144,16 @@ def receive_job(config: RunConfig, transport: Transport) -> Job:
     return Job(config.model_copy(update=settled), scene)
 
 
-    bits_bytes = (len(octree) + 7) // 8
-    for _ in range(job.n_frames):
+def _sample(job: Job, transport: Transport) -> None:
+    clock = StageClock("sampling")
     if job.config.scene.delivery == "messages":
         serve_scene(job.scene, job.colour, transport, RENDER)
+    octree = job.scene.octree(features=job.wanted.features)
+    sampling = job.sampling_node(octree)
+    sampling.process(job.camera(0), job.culling_node(octree).process(job.camera(0)))
+    transport.meet()
+    bits_bytes = (len(octree) + 7) // 8
+    for _ in range(job.n_frames):
         with clock.waiting():
             camera = decode_camera(*transport.receive(CULLING, Kind.CAMERA, _MAX_CAMERA_BYTES))
             bits = decode_visibility(*transport.receive(CULLING, Kind.VISIBILITY, bits_bytes), len(octree))
