@@ -68,15 +68,15 @@ class CameraSection(Section):
     elevation_deg: Annotated[float, Field(ge=-90, le=90)] = 25.0
     start_deg: float = 0.0
     sweep_deg: float = 360.0
-    keyframes: list[Keyframe] = []
-    poses: list[Matrix] = []
+    keyframes: list[Keyframe] = Field(default=[])
+    poses: list[Matrix] = Field(default=[])
 
 
 class FilterSection(Section):
     """``[filter]``."""
 
     classes: list[Annotated[int, Field(ge=0, le=255)]] = []
-    boxes: list[Box] = []
+    boxes: list[Box] = Field(default=[])
 
 
 class CullingSection(Section):
@@ -107,7 +107,7 @@ class RenderSection(Section):
     colour: str = "auto"
     colormap: str = "viridis"
     colour_range: tuple[float, float] | None = None
-    class_colours: dict[str, str] = {}
+    class_colours: dict[str, str] = Field(default={})
     background: str = "#1e2127"
     supersampling: Annotated[int, Field(ge=1, le=8)] = 1
     edl_strength: Annotated[float, Field(ge=0, le=1e6)] = 0.0
@@ -154,7 +154,7 @@ class RunConfig(Section):
     sampling: SamplingSection = SamplingSection()
     render: RenderSection = RenderSection()
     splats: SplatSection = SplatSection()
-    layers: list[LayerSection] = []
+    layers: list[LayerSection] = Field(default=[])
     pipeline: PipelineSection = PipelineSection()
     output: OutputSection = OutputSection()
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from .gl_gradient import Gradient
 from .gl_layer import VARYINGS, GlLayer, commands, layer_shader
-from .gradient import Gradient
 from .mesh import CUBE_CORNER, CUBE_NORMAL
 
 _RECORD = "2f4 2f4 2f4 1f4"

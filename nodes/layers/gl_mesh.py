@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .gl_gradient import Gradient
 from .gl_layer import GlLayer, commands, layer_shader
-from .gradient import Gradient
 from .mesh import Mesh
 
 if TYPE_CHECKING:
