@@ -2,7 +2,8 @@
 
 Nobody keeps a list of what a run needs. The render rank's scene stands on ``ReceivedArrays``, which asks for an array
 when something loads it, so what nothing loads does not cross. Arrays cross as they are stored: coded positions are
-decoded where they are drawn. Checksums are those of ``scene.json``, compared on the render rank as ``scene.verify`` says.
+decoded where they are drawn. Checksums are those of ``scene.json``, compared on the render rank as ``scene.verify``
+says.
 """
 
 from __future__ import annotations
@@ -98,7 +99,9 @@ class ReceivedArrays:
             data = np.empty(n_bytes, np.uint8)
         except (MemoryError, ValueError):
             name = list(self._info.arrays)[array]
-            raise MessageError(f"scene of rank {self._rank}: {name} has {n_bytes} bytes, more than memory has") from None
+            raise MessageError(
+                f"scene of rank {self._rank}: {name} has {n_bytes} bytes, more than memory has"
+            ) from None
         under_way: deque[SceneRequest] = deque()
         for first in range(0, n_bytes, SCENE_PIECE_BYTES):
             if len(under_way) == ASKED_AHEAD:

@@ -38,6 +38,7 @@ def parts(job: Job, work: Workload, decision: Decision) -> list[Part]:
     """All parts, left out or kept, of a run with this topology and an average frame like this."""
     return [
         _mpi(decision),
+        _delivery(job, decision),
         _compositing(work),
         _back_face_test(job, work),
         _level_of_detail(job, work),
@@ -80,6 +81,21 @@ def _mpi(decision: Decision) -> Part:
     if decision.estimate is None:
         return Part(MPI, single, decision.reason, COSTS.message_s * 1e3, "ms/frame")
     return Part(MPI, single, decision.reason, -decision.estimate.saved_s, "s/run")
+
+
+def _delivery(job: Job, decision: Decision) -> Part:
+    arrays = job.scene.info.arrays
+    read = {"x", "y", "z", "position_codes", "cell_position_bytes", "block_first_point", "block_origin"}
+    read |= {f"attr_{name}" for name in job.attributes_read}
+    sent_mb = 1e-6 * sum(array.bytes for name, array in arrays.items() if name in read)
+    what, unit = "delivery of the scene by messages", "MB sent once"
+    if decision.topology == "single":
+        return Part(what, True, "one rank: scene.delivery has no effect, it opens the scene", sent_mb, unit)
+    if job.config.scene.delivery == "files":
+        return Part(what, True, "scene.delivery is files: every rank opens the scene", sent_mb, unit)
+    form = job.scene.info.positions
+    why = f"scene.delivery is messages: the render rank opens none of its files; positions cross as {form}"
+    return Part(what, False, why, sent_mb, unit)
 
 
 def _compositing(work: Workload) -> Part:
