@@ -75,7 +75,7 @@ class CameraSection(Section):
 class FilterSection(Section):
     """``[filter]``."""
 
-    classes: list[Annotated[int, Field(ge=0, le=255)]] = []
+    classes: list[Annotated[int, Field(ge=0, le=255)]] = Field(default=[])
     boxes: list[Box] = Field(default=[])
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from splatpipe.shared.config import RunConfig, load_config, parse_config
 from splatpipe.shared.errors import ConfigError
+from splatpipe.shared.layer_config import LayerSection
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 RUNS = sorted([*CONFIGS.glob("*.toml"), *CONFIGS.glob("gallery/*.toml")])  # the other folders are of other commands
@@ -19,7 +20,20 @@ def test_defaults_file_states_every_key_with_its_default():
         for key in keys:
             assert f"# {key} = " in (CONFIGS / "defaults.toml").read_text()
             assert actual[section].pop(key) is None
+    assert actual.pop("layers") == []
     assert stated == actual
+
+
+def test_defaults_file_states_every_key_of_a_layer():
+    text = (CONFIGS / "defaults.toml").read_text()
+    block = text[text.index("# [[layers]]") :].split("\n\n")[0]
+    (stated,) = tomllib.loads("\n".join(line.removeprefix("# ") for line in block.splitlines()))["layers"]
+    defaults = LayerSection(path="").model_dump(mode="json")
+    assert stated.keys() == defaults.keys()
+    for key, default in defaults.items():
+        if isinstance(default, dict):
+            assert stated[key].keys() == default.keys()
+        assert default is None or stated[key] == default
 
 
 @pytest.mark.parametrize("path", RUNS, ids=lambda p: p.name)
