@@ -20,18 +20,12 @@ SAMPLES = 16
 """How many of them are asked for their neighbours; the median counts."""
 
 
-def owners_in_order(octree: Octree) -> np.ndarray:
-    """(b,) indices of the cells that own points, in stored order."""
-    owners = np.flatnonzero(octree.n_points if octree.point_order == "layered" else octree.is_leaf)
-    return owners[np.argsort(octree.first_point[owners])]
-
-
 def cell_blocks(scene: Scene, octree: Octree) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """((b,) int64 first point, (b, 3) float64 origin, (b,) int32 cell) of the cells that own points, in stored order.
 
     A cell's origin is that of the block it is stored in, so no coordinate changes.
     """
-    owners = owners_in_order(octree)
+    owners = octree.owners
     first_point = octree.first_point[owners]
     first, origin = scene.blocks()
     return first_point, origin[np.searchsorted(first, first_point, side="right") - 1], owners.astype(np.int32)
@@ -41,7 +35,7 @@ def cell_features(octree: Octree) -> CellFeatures:
     """What the cells that own points look like, in stored order, of an octree loaded with features."""
     assert octree.feature is not None
     assert octree.quad is not None
-    owners = owners_in_order(octree)
+    owners = octree.owners
     quad = octree.quad[owners]
     return CellFeatures(
         first_point=octree.first_point[owners],

@@ -78,7 +78,7 @@ def load_points(scene: Scene, colouring: Colouring, wanted: Wanted = Wanted(), *
     if verify:
         attributes = [colouring.attribute, "classification" if wanted.point_filter.classes else None]
         attributes += ["normal", "radius"] if wanted.splats else []
-        scene.check(["x", "y", "z", *(f"attr_{name}" for name in dict.fromkeys(attributes) if name)])
+        scene.check([*scene.info.position_arrays, *(f"attr_{name}" for name in dict.fromkeys(attributes) if name)])
     x, y, z = scene.positions()
     if wanted.point_filter:
         x = wanted.point_filter.filtered_x(scene, x, y, z)

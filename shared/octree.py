@@ -75,6 +75,12 @@ class Octree:
         return self.first_child < 0
 
     @cached_property
+    def owners(self) -> np.ndarray:
+        """(c,) int64: the cells that own points, in stored order."""
+        owners = np.flatnonzero(self.is_leaf if self.point_order == "depth-first" else self.n_points)
+        return owners[np.argsort(self.first_point[owners])]
+
+    @cached_property
     def half_edges(self) -> np.ndarray:
         """(n,) float64: half the edge of each cell's cube, world units."""
         return np.ldexp(self.edge, -self.level.astype(np.int32) - 1)

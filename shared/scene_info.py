@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from .codecs import MAX_BITS, MAX_STREAM_BITS
+from .codecs.positions import most_position_bits
 from .errors import StoreError
 from .points import ATTRIBUTES
 
@@ -114,6 +115,16 @@ class SceneInfo:
         """Whether points have what splats need: normals and radii."""
         return {"normal", "radius"} <= set(self.attributes)
 
+    @property
+    def coded(self) -> bool:
+        """Whether positions are in the form of a codec."""
+        return self.positions != "float32"
+
+    @property
+    def position_arrays(self) -> tuple[str, ...]:
+        """The arrays that hold the positions of points."""
+        return ("position_codes",) if self.coded else ("x", "y", "z")
+
     def to_json(self) -> str:
         """The text of ``scene.json``."""
         return json.dumps(asdict(self), indent=1, allow_nan=False) + "\n"
@@ -168,8 +179,19 @@ def info_from_json(text: bytes, path: Path) -> SceneInfo:
         name: ArrayInfo(a["dtype"], tuple(a["shape"]), a["bytes"], a["crc32"]) for name, a in values["arrays"].items()
     }
     info = SceneInfo(**values)
+    _check_positions(path, info)
     _check_arrays(path, info)
     return info
+
+
+def _check_positions(path: Path, info: SceneInfo) -> None:
+    most_bits = most_position_bits(info.positions) if info.coded else 0
+    if not min(1, most_bits) <= info.position_bits <= most_bits:
+        expected = f"1 … {most_bits}" if info.coded else "0"
+        raise StoreError(f"{path}: position_bits = {info.position_bits} of {info.positions}, expected {expected}")
+    if info.coded != (info.position_bytes > 0):
+        expected = "a whole number > 0" if info.coded else "0"
+        raise StoreError(f"{path}: position_bytes = {info.position_bytes} of {info.positions}, expected {expected}")
 
 
 def expected_arrays(info: SceneInfo) -> dict[str, tuple[np.dtype, tuple[int, ...]]]:
@@ -180,18 +202,15 @@ def expected_arrays(info: SceneInfo) -> dict[str, tuple[np.dtype, tuple[int, ...
         "cell_area": info.point_order == "layered" and info.format_version >= 2,
         "cell_feature": info.features,
         "cell_quad": info.features,
-        "cell_position_bytes": info.positions != "float32",
+        "cell_position_bytes": info.coded,
         "cell_pool_points": info.pool_bits > 0,
         "cell_pool_bytes": info.pool_bits > 0,
     }
     for name, dtype in CELL_ARRAYS.items():
         if present.get(name, True):
             expected[name] = (dtype, (info.n_cells, *_ROW_SHAPES.get(name, ())))
-    if info.positions == "float32":
-        for name in ("x", "y", "z"):
-            expected[name] = (np.dtype("<f4"), (info.n_stored,))
-    else:
-        expected["position_codes"] = (np.dtype("u1"), (info.position_bytes,))
+    for name in info.position_arrays:
+        expected[name] = (np.dtype("u1"), (info.position_bytes,)) if info.coded else (np.dtype("<f4"), (info.n_stored,))
     if info.pool_bits:
         expected["pool_codes"] = (np.dtype("u1"), (info.pool_bytes,))
     for name in info.attributes:

@@ -169,6 +169,11 @@ class _Build:
                 points, keys = runs.load(partition)
             self.add_partition(points, keys, partition.level, partition.code, n_total)
             return
+        if self.settings.positions != "float32":
+            raise InputError(
+                f"build: positions = {self.settings.positions!r}: a cell of {partition.n_points} points does not fit "
+                "into memory, expected float32, or more memory"
+            )
         with self.timed("write"):
             cells, root_set = append_streamed_leaf(
                 partition, runs, self.memory.capacity, self.settings, self.surface, self.array, self.workers
@@ -219,22 +224,27 @@ class _Build:
         """Write the cells, the blocks and ``scene.json``, and put the scene in its place."""
         cells = self.assembly.cell_arrays("normal" in self.attributes)
         first, block_origin = self.array.blocks()
-        if self.settings.features:
-            with self.timed("features"):
-                cells |= cell_features(cells, origin, edge, first, block_origin, self.writer.written, self.workers)
         position_bytes = pool_bytes = pool_bits = 0
-        if self.settings.positions != "float32":
+        coded = self.settings.positions != "float32"
+        if coded:
             with self.timed("positions"):
                 cells |= code_positions(
                     cells,
                     origin,
                     edge,
+                    first,
+                    block_origin,
                     float(np.max(tally.upper - tally.lower)),
                     self.settings,
+                    self.memory.capacity,
                     self.writer,
                     self.workers,
+                    lambda done, total: self.progress("positions", done, total),
                 )
                 position_bytes = int(cells["cell_position_bytes"].sum(dtype=np.int64))
+        if self.settings.features:
+            with self.timed("features"):
+                cells |= cell_features(cells, origin, edge, first, block_origin, self.writer.written, self.workers)
         if self.settings.pools:
             with self.timed("pools"):
                 pool_bits = self.settings.pool_bits or suited_bits(self.settings.points_per_cell)
@@ -253,6 +263,8 @@ class _Build:
                     lambda done, total: self.progress("pools", done, total),
                 )
                 pool_bytes = int(cells["cell_pool_bytes"].sum(dtype=np.int64))
+        for axis in "xyz" if coded else "":
+            self.writer.drop(axis)
         for name, values in {**cells, "block_first_point": first, "block_origin": block_origin}.items():
             self.writer.write_array(name, values)
         info = SceneInfo(
@@ -269,7 +281,7 @@ class _Build:
             attributes=self.attributes,
             features=self.settings.features,
             positions=self.settings.positions,
-            position_bits=self.settings.position_bits if position_bytes else 0,
+            position_bits=self.settings.position_bits if coded else 0,
             position_bytes=position_bytes,
             pool_bits=pool_bits,
             pool_bytes=pool_bytes,

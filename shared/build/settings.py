@@ -7,7 +7,8 @@ import resource
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ..codecs import MAX_BITS, MAX_STREAM_BITS
+from ..codecs import MAX_STREAM_BITS
+from ..codecs.positions import most_position_bits
 from ..errors import InputError
 from ..octree import MAX_LEVEL
 from ..points import ATTRIBUTES
@@ -65,6 +66,7 @@ class BuildSettings:
     threads: int | None = None
 
     def __post_init__(self) -> None:
+        most_bits = most_position_bits(self.positions)
         unknown = [a for a in self.attributes or () if a not in ATTRIBUTES]
         for holds, key, expected in (
             (self.point_order in POINT_ORDERS, "point_order", f"one of {', '.join(POINT_ORDERS)}"),
@@ -76,7 +78,7 @@ class BuildSettings:
             (not unknown, "attributes", f"names of {', '.join(ATTRIBUTES)}"),
             (self.normals in NORMALS, "normals", f"one of {', '.join(NORMALS)}"),
             (self.positions in POSITIONS, "positions", f"one of {', '.join(POSITIONS)}"),
-            (1 <= self.position_bits <= MAX_BITS, "position_bits", f"1 … {MAX_BITS}"),
+            (1 <= self.position_bits <= most_bits, "position_bits", f"1 … {most_bits} for {self.positions}"),
             (0 <= self.group_epsilon <= 1, "group_epsilon", "a number in [0, 1]"),
             (0 <= self.pool_bits <= MAX_STREAM_BITS, "pool_bits", f"0 … {MAX_STREAM_BITS}"),
             (1 <= self.n_pools <= 16, "n_pools", "1 … 16"),
@@ -187,6 +189,8 @@ _SORT_BYTES = 4 + 4 + 10
 """A point's index, a second index while cells are refined, and two and a half stored indices (layered)."""
 NEIGHBOUR_BYTES = 248
 """A point while neighbours are searched: order, position in that order, tree, neighbours, results."""
+CODING_BYTES = 300
+"""A point while the positions of its cell are coded, and decoded again: grid point, keys, order, nodes of a codec."""
 _READER_BYTES = 320
 """A point in a reader: file bytes, decoded columns and temporaries, one batch ahead."""
 _MIN_CAPACITY = 1 << 16
@@ -200,7 +204,7 @@ def plan_memory(settings: BuildSettings, attributes: tuple[str, ...], neighbours
     Raises InputError if it is too little for a partition of a few cells.
     """
     budget = settings.memory_bytes or available_memory_bytes() // 2
-    working = max(_SORT_BYTES, NEIGHBOUR_BYTES * neighbours)
+    working = max(_SORT_BYTES, NEIGHBOUR_BYTES * neighbours, CODING_BYTES * (settings.positions != "float32"))
     point_bytes = 24 + sum(ATTRIBUTES[a].itemsize for a in attributes) + _KEY_BYTES + working
     left = budget - resident_bytes() - _FIXED_BYTES
     capacity = min(left * 3 // 4 // point_bytes, 2**32 - 1)

@@ -6,7 +6,7 @@ import fcntl
 import os
 import shutil
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
@@ -63,6 +63,10 @@ class ColumnFile:
     def written(self) -> np.ndarray:
         """The rows so far: a read-only map."""
         return np.memmap(self.path, self.dtype, "r", self._data_offset, (self._rows, *self._row_shape))
+
+    def rename(self, name: str) -> None:
+        """Go on under another name."""
+        self.path = self.path.rename(self.path.with_name(f"{name}.npy"))
 
     def close(self) -> ArrayInfo:
         """Write the final header."""
@@ -142,6 +146,25 @@ class SceneWriter:
         array = np.ascontiguousarray(array)
         with writing(self.partial):
             self.open_column(name, array.dtype, array.shape[1:]).write(array)
+
+    def drop(self, name: str) -> None:
+        """Remove an array that the scene is not to have after all; maps of it stay valid."""
+        column = self.columns.pop(name)
+        column.abandon()
+        with writing(self.partial):
+            column.path.unlink()
+
+    @contextmanager
+    def rewriting(self, names: Iterable[str]) -> Iterator[dict[str, ColumnFile]]:
+        """A new file for each of these arrays, empty, which takes its place at the end; maps of the old stay valid."""
+        names = list(names)
+        files = {name: self.open_column(f"{name}.new", self.columns[name].dtype) for name in names}
+        yield files
+        for name, file in files.items():
+            self.drop(name)
+            with writing(self.partial):
+                file.rename(name)
+            self.columns[name] = self.columns.pop(f"{name}.new")
 
     def written(self, name: str) -> np.ndarray:
         """What has been written of an array: a read-only map."""

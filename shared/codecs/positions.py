@@ -3,7 +3,15 @@
 from __future__ import annotations
 
 from ..errors import CodecError
-from . import Codec
+from . import MAX_BITS, Codec
+
+_MOST_GROUP_BITS = 16
+"""Kept points of linear groups are drawn from words of 16 bits an axis (``nodes.raster.groups``)."""
+
+
+def most_position_bits(name: str) -> int:
+    """Most bits an axis of the grid that a codec of positions is used with."""
+    return _MOST_GROUP_BITS if name == "groups" else MAX_BITS
 
 
 def position_codec(name: str, epsilon: float = 0.0) -> Codec:
