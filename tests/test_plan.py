@@ -64,6 +64,7 @@ def test_a_bare_scene_leaves_out_what_it_has_no_use_for(config):
     found = names(job_of(config, "render.colour=#ff8000", "sampling.pixel_threshold=0"))
     assert found == {
         named.MPI,
+        "delivery of the scene by messages",
         "compositing",
         named.NO_NORMALS,
         named.LEVEL_OF_DETAIL,
@@ -141,6 +142,21 @@ def test_what_a_picture_asks_for_is_kept_and_what_it_costs_is_said(config, scene
     unlit = estimate(job_of(config), WORK, cores=2)
     lit = estimate(job_of(config, "render.edl_strength=0.5", "output.png=true"), WORK, cores=2)
     assert lit.render_s - unlit.render_s == pytest.approx(WORK.pixels * (COSTS.edl_s / 2 + COSTS.picture_s))
+
+
+def test_a_scene_is_delivered_by_messages_where_there_is_another_rank_and_it_is_asked_for(config):
+    def delivery(job, topology):
+        found = {part.what: part for part in parts(job, Workload.of_look(job), Decision(topology, "so"))}
+        return found["delivery of the scene by messages"]
+
+    job = job_of(config, "scene.delivery=messages", "render.colour=#ff8000")
+    kept = delivery(job, "pipelined")
+    assert not kept.left_out
+    info = job.scene.info
+    assert kept.gain == pytest.approx(1e-6 * (12 * info.n_stored + 32 * info.n_blocks))
+    assert delivery(job, "single").left_out
+    assert "no effect" in delivery(job, "single").why
+    assert delivery(job_of(config), "pipelined").left_out
 
 
 def test_a_scene_of_one_cell_has_no_level_of_detail(config, scenes):
