@@ -11,10 +11,10 @@ from ..nodes.culling import CullingNode
 from ..nodes.picture.compose import Composer, Picture, PictureSettings
 from ..nodes.point_filter import PointFilter
 from ..nodes.raster import MAX_SIDE_PX, PointSize, Rasterizer, ResidentPoints, SplatSettings
-from ..nodes.raster.choose import check_style, make_rasterizer
+from ..nodes.raster.choose import DRAW_POOLS, check_style, draws_pools, make_rasterizer, resolve_rasterizer
 from ..nodes.raster.cpu import kernels_cached
 from ..nodes.render import RenderNode, Wanted, load_points
-from ..nodes.sampling import SamplingNode
+from ..nodes.sampling import Pools, SamplingNode
 from ..shared.camera import Camera
 from ..shared.colour import Colouring, parse_colour
 from ..shared.config import RunConfig
@@ -70,11 +70,15 @@ class Job:
         check_style(render.rasterizer, self.splats)
         self.background = parse_colour(render.background, "render.background")
         self.colouring = Colouring.choose(
+        self.why_no_pools = self._why_no_pools()
+        self.pools: Pools = "off" if self.why_no_pools else config.sampling.pools
             self.scene, render.colour, render.colormap, render.colour_range, render.class_colours
         )
         self.colour = self.colouring.mode if render.colour == "auto" else render.colour
         if self.splats and self.splats.lighting and self.colouring.mode == "normal":  # light falls on a splat once
             self.colouring = Colouring.choose(self.scene, SPLAT_COLOUR)
+            groups=self.coded,
+            pools=self.pools != "off",
         self.views = camera_views(config.camera, info, self.n_pictures, render.supersampling)
         self.n_frames = self.n_pictures * self.views.per_picture
         largest_px = render.supersampling * max(config.camera.width, config.camera.height)
@@ -102,6 +106,35 @@ class Job:
         of those that are averaged has points of its own.
         """
         points_per_pixel = self.config.sampling.points_per_pixel
+    def _why_no_pools(self) -> str:
+        """Why this run draws nothing from pools; empty if it may."""
+        config = self.config
+        if config.sampling.pools == "off":
+            return "sampling.pools is off"
+        if self.point_filter:
+            return "points are filtered, and pooled ones cannot be taken out"
+        if config.render.positions == "coded":
+            return "render.positions is coded: its rasterizer draws no pools"
+        if self.splats:
+            return "splats are drawn, and pooled points have no radii"
+        if not draws_pools(config.render.rasterizer):
+            return f"rasterizer {resolve_rasterizer(config.render.rasterizer)} draws none, {', '.join(DRAW_POOLS)} does"
+        return ""
+
+    @property
+    def position_bytes(self) -> int:
+        """Bytes of a position as it is read; compact ones as where cells are small on the screen, at least."""
+        return 4 if self.compact else 12
+
+    @property
+    def colour_bytes(self) -> int:
+        """Bytes of a point's colour."""
+        return 0 if self.colouring.mode == "constant" else 4
+
+    def load_octree(self) -> Octree:
+        """The cells, with what the sampling node of this run needs of them. Raises StoreError."""
+        return self.scene.octree(features=self.wanted.features, pools=self.wanted.pools)
+
         return SamplingNode(
             octree,
             pixel_threshold=self.pixel_threshold * self.config.render.supersampling,
@@ -122,6 +155,9 @@ class Job:
             self.views.height,
             self.point_size,
             render.threads or None,
+            whole_sets=self.coded,
+            pools=self.pools,
+            point_bytes=self.position_bytes + self.colour_bytes,
             splats=self.splats,
             compact=self.compact,
         )
@@ -136,7 +172,7 @@ class Job:
             rasterizer = stack.enter_context(self.make_rasterizer(points))
             self.scene.release()
             node = RenderNode(rasterizer)
-            if rasterizer.name == "cpu" and not kernels_cached():
+            if rasterizer.name == "cpu" and not kernels_cached(self.wanted.pools):
                 progress("compiling kernels (once; kept for the next run)", 0)
             node.warm_up(self.camera(0))
             composer = sink = None

@@ -38,7 +38,7 @@ def run_single(job: Job, progress: Progress) -> dict[str, Any]:
     loading = time.perf_counter()
     clocks = [StageClock(role) for role in ROLES]
     counts = FrameCounts()
-    octree = job.scene.octree(features=job.wanted.features)
+    octree = job.load_octree()
     culling, sampling = job.culling_node(octree), job.sampling_node(octree)
     sampling.process(job.camera(0), culling.process(job.camera(0)))  # compiles, or loads what was compiled
     with job.open_render(progress) as render:
@@ -148,7 +148,7 @@ def _sample(job: Job, transport: Transport) -> None:
     clock = StageClock("sampling")
     if job.config.scene.delivery == "messages":
         serve_scene(job.scene, job.colour, transport, RENDER)
-    octree = job.scene.octree(features=job.wanted.features)
+    octree = job.load_octree()
     sampling = job.sampling_node(octree)
     sampling.process(job.camera(0), job.culling_node(octree).process(job.camera(0)))
     transport.meet()

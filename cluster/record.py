@@ -48,7 +48,9 @@ class StageClock:
 
 
 class FrameCounts:
-    """How much of everything each frame had: cells that may be seen, render-points entries, points drawn."""
+    """How much of everything each frame had: cells that may be seen, render-points entries, points drawn;
+    of those, the pooled ones.
+    """
 
     def __init__(self) -> None:
         self._lists: dict[str, list[int]] = {}
@@ -59,7 +61,7 @@ class FrameCounts:
             if isinstance(message, VisibilityBits):
                 found = {"cells_visible": int(np.bitwise_count(message.bits).sum())}
             else:
-                found = {"entries": len(message.entries), "points": message.n_points}
+                found = {"entries": len(message.entries), "points": message.n_points, "pooled_points": message.n_pooled}
             for name, count in found.items():
                 self._lists.setdefault(name, []).append(count)
 

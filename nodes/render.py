@@ -5,7 +5,7 @@ Frames need no cell of the octree; what goes by cell is made when points are loa
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from ..shared.messages import RENDER_POINT, RenderPoints
 from ..shared.store import Scene
 from .cell_blocks import cell_blocks, cell_features, cell_spacing
 from .point_filter import PointFilter, features_left
+from .pooled_entries import PooledForms
 from .raster import Rasterizer, ResidentPoints
 
 
@@ -49,7 +50,8 @@ class Wanted:
     """What a run needs of the points besides position and colour; nothing else is loaded.
 
     splats : normals and radii.  features : classes and quads of the cells.
-    cells : blocks as single cells.  spacing : the spacing of their points.
+    cells : blocks as single cells.  spacing : the spacing of their points.  pools : the pooled forms of cells.
+    groups : positions as linear groups (``grouped_cells``), not decoded.
     point_filter : which points are drawn at all; the others get NaN as their x.
     """
 
@@ -57,6 +59,8 @@ class Wanted:
     features: bool = False
     cells: bool = False
     spacing: bool = False
+    pools: bool = False
+    groups: bool = False
     point_filter: PointFilter = field(default_factory=PointFilter)
 
     def check(self, scene: Scene) -> None:
@@ -65,6 +69,10 @@ class Wanted:
             raise StoreError(f"{scene.path}: no radii and normals of splats: build it with --splats")
         if self.features and not scene.info.features:
             raise StoreError(f"{scene.path}: no features of cells: build it with --features")
+        if self.groups and scene.info.positions != "groups":
+            raise StoreError(f"{scene.path}: positions are {scene.info.positions}: build it with --positions groups")
+        if self.pools and not scene.info.pool_bits:
+            raise StoreError(f"{scene.path}: no pooled cells: build it with --pools")
 
 
 def load_points(scene: Scene, colouring: Colouring, wanted: Wanted = Wanted(), *, verify: bool) -> ResidentPoints:
@@ -79,12 +87,13 @@ def load_points(scene: Scene, colouring: Colouring, wanted: Wanted = Wanted(), *
         attributes = [colouring.attribute, "classification" if wanted.point_filter.classes else None]
         attributes += ["normal", "radius"] if wanted.splats else []
         scene.check([*scene.info.position_arrays, *(f"attr_{name}" for name in dict.fromkeys(attributes) if name)])
+        scene.check(["pool_codes"] if wanted.pools else [])
     x, y, z = scene.positions()
     if wanted.point_filter:
         x = wanted.point_filter.filtered_x(scene, x, y, z)
     block_spacing = features = None
     if wanted.cells or wanted.features:
-        octree = scene.octree(features=wanted.features)
+        octree = scene.octree(features=wanted.features, pools=wanted.pools)
         features = cell_features(octree) if wanted.features else None
         if features and wanted.point_filter:
             features = features_left(features, x)
@@ -94,7 +103,7 @@ def load_points(scene: Scene, colouring: Colouring, wanted: Wanted = Wanted(), *
             block_spacing = cell_spacing(scene, octree, cells)
     else:
         block_first_point, block_origin = scene.blocks()
-    return ResidentPoints(
+    points = ResidentPoints(
         x,
         y,
         z,
@@ -107,3 +116,13 @@ def load_points(scene: Scene, colouring: Colouring, wanted: Wanted = Wanted(), *
         block_spacing=block_spacing,
         features=features,
     )
+    if wanted.pools:
+        from .pooled_cells import load_pools
+
+        pools = load_pools(scene, points)
+        if block_spacing is not None:
+            spacing = np.zeros(len(octree))
+            spacing[cells] = block_spacing
+            pools = pools._replace(world_side=spacing[PooledForms.of(octree).cell])
+        points = replace(points, pools=pools)
+    return points

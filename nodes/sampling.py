@@ -8,11 +8,17 @@ The projected size of a cell is its edge, in pixels, at the distance from the ey
 at the near plane if that is farther. (The thesis divides the diagonal by the distance of the centre, which underrates
 a large cell that the eye is in or close to.) It does not change when the camera only turns, and at least halves from
 a cell to its child. Stretch off the view axis is not counted.
+
+A cut cell that has a pooled form (``shared.codecs.streams``) may be drawn from it, whole, in place of its range: where
+its grid is so fine that a bin is at most 1/√2 pixel wide, that is where the cell is at most 2**bits / √2 pixels across
+(Kim, Lee, Varshney, "Vertex Transformation Streams", section 6), and where that reads fewer bytes or takes less time.
+The form has every bin that holds a point of the set, so it is never sparser than a part of the set seen on that grid.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 import numpy as np
 from numba import njit
@@ -21,12 +27,18 @@ from ..shared.camera import Camera
 from ..shared.errors import ConfigError, MessageError
 from ..shared.messages import RENDER_POINT, RenderPoints, VisibilityBits
 from ..shared.octree import CORNER, EDGE, MAX_LEVEL, Octree
+from .pooled_entries import POINT_BYTES, PooledForms
+
+Pools = Literal["off", "bytes", "time"]
 
 MAX_RANGE = 2**32 - 1
 """Longest range of one entry; a longer one is split."""
 SHARP_DENSITY = 2.0
 """Points of cells with an edge or a corner, in points of other cells of the same area (thesis 4.4.3)."""
+POOLED_POINT_COST = 1.3
+"""Time of drawing a pooled point on the CPU, in points of a range (RESULTS.md)."""
 _EXPANDED = -1
+_POOLED = -2
 
 
 class SamplingNode:
@@ -38,16 +50,29 @@ class SamplingNode:
     points_per_pixel : points of a set in stratified order, for each pixel that the surface in its cell covers where it
         is seen face on (``Octree.area``); ``SHARP_DENSITY`` times as many where the octree tells edges and corners.
     whole_sets : draw a cut cell with all its points, where a head of them has no meaning (linear groups).
-    Raises ConfigError for a threshold that is not a finite number ≥ 0, or points per pixel that are not one > 0.
+    pools : whether cells are drawn from their pooled form: never; where that reads fewer ``bytes``, or where it takes
+        less ``time`` (``POOLED_POINT_COST``). The octree needs their sizes.
+    point_bytes : what drawing a point of a range reads.
+    Raises ConfigError for a threshold that is not a finite number ≥ 0, points per pixel that are not one > 0, or an
+    octree without pooled forms where they are to be drawn.
     """
 
     def __init__(
-        self, octree: Octree, *, pixel_threshold: float, points_per_pixel: float = 2.0, whole_sets: bool = False
+        self,
+        octree: Octree,
+        *,
+        pixel_threshold: float,
+        points_per_pixel: float = 2.0,
+        whole_sets: bool = False,
+        pools: Pools = "off",
+        point_bytes: int = POINT_BYTES,
     ):
         if not (pixel_threshold >= 0 and math.isfinite(pixel_threshold)):
             raise ConfigError(f"sampling.pixel_threshold = {pixel_threshold}, expected a number ≥ 0")
         if not (points_per_pixel > 0 and math.isfinite(points_per_pixel)):
             raise ConfigError(f"sampling.points_per_pixel = {points_per_pixel}, expected a number > 0")
+        if pools != "off" and octree.pool_points is None:
+            raise ConfigError(f"sampling.pools = {pools!r}: the octree was loaded without pooled forms")
         self.pixel_threshold = float(pixel_threshold)
         self.points_per_pixel = float(points_per_pixel)
         self.whole_sets = whole_sets
@@ -62,9 +87,15 @@ class SamplingNode:
         self._leaf_points = np.where(octree.is_leaf, octree.n_points, 0)
         n_stored = int((octree.first_point + octree.n_points).max())
         self._n_splits = 2 * n_stored // MAX_RANGE  # a piece fills at least half an entry
+        self._forms = None if pools == "off" else PooledForms.of(octree)
+        if self._forms is not None:
+            costs = self._forms.n_bytes / point_bytes, POOLED_POINT_COST * np.diff(self._forms.first)
+            self._worth = costs[pools == "time"]
+        self._pooled_entries = np.empty(0 if self._forms is None else len(self._forms), RENDER_POINT)
 
     def process(self, camera: Camera, bits: VisibilityBits) -> RenderPoints:
-        """The render-points array of one frame, ascending in offset, adjacent ranges merged.
+        """The render-points array of one frame: ranges, ascending in offset, then pooled points, ascending; adjacent
+        ones merged.
 
         Every visible leaf has exactly one drawn ancestor-or-self, and nothing invisible is drawn. N being the
         square of its projected size and A its area, a cell whose points stand in stratified order yields the first
@@ -73,9 +104,11 @@ class SamplingNode:
         depth-first order; and a leaf above the threshold all its points. With ``whole_sets`` the same cells yield all
         the points of their range, in entries of stride 1.
 
+        A cell is drawn in one form: pooled where it is small enough and that is less than those points would be.
+
         Raises MessageError if the bits belong to another frame or another octree.
         Cost: O(cells in the level-of-detail window) plus a scan of one word per cell. With a threshold of 0 no
-        projected size is computed.
+        projected size is computed. Pools add a look at each cell that has a form, and nothing where they are off.
         """
         tree = self._octree
         if bits.frame != camera.frame or bits.n_cells != len(tree):
@@ -88,9 +121,12 @@ class SamplingNode:
             np.copyto(self._n_drawn, tree.n_points, where=self._n_drawn > 0)
         entries = np.empty(n_cut + self._n_splits, RENDER_POINT)
         strided = tree.point_order == "depth-first"
-        n_entries = _merge(
+        n_pooled = self._take_pools(camera, strided) if self._forms else 0
+        n_ranges = _merge(
             tree.first_point, tree.n_points, self._n_drawn, self._stored_order, strided, MAX_RANGE, entries
         )
+        n_entries = n_ranges + n_pooled
+        entries[n_ranges:n_entries] = self._pooled_entries[:n_pooled]
         return RenderPoints(camera.frame, entries[:n_entries])
 
     def _cut(self, camera: Camera, bits: VisibilityBits) -> int:
@@ -117,6 +153,28 @@ class SamplingNode:
             self._n_drawn,
         )
 
+    def _take_pools(self, camera: Camera, strided: bool) -> int:
+        """Mark cells of the cut that are drawn from their pooled form, and fill ``_pooled_entries``; how many."""
+        tree, forms = self._octree, self._forms
+        assert forms
+        return _take_pools(
+            forms.cell,
+            forms.first,
+            self._worth,
+            0.5 * 4.0**tree.pool_bits,
+            tree.centers,
+            tree.level,
+            tree.n_points,
+            self._edge,
+            camera.eye,
+            camera.near,
+            camera.focal_px,
+            strided,
+            MAX_RANGE,
+            self._n_drawn,
+            self._pooled_entries,
+        )
+
     def _all_leaves(self, bits: VisibilityBits) -> int:
         """The same without level of detail: every visible leaf, whatever its size on the screen."""
         np.multiply(self._leaf_points, bits.unpack(), out=self._n_drawn)
@@ -127,6 +185,18 @@ class SamplingNode:
 def points_needed(n_pixels):
     """max(1, ⌊N ln N⌋) as float64: points that, picked at random, cover N pixels (thesis 4.3.2)."""
     return max(1.0, np.floor(n_pixels * np.log(n_pixels))) if n_pixels > 1.0 else 1.0
+
+
+@njit(nogil=True, cache=True)
+def _projected_pixels(centers, cell, edge, eye, near, focal_px):
+    """Square of a cell's projected size, float64."""
+    edge_px = edge * focal_px
+    half = 0.5 * edge
+    distance_2 = 0.0
+    for axis in range(3):
+        gap = max(0.0, abs(centers[cell, axis] - eye[axis]) - half)
+        distance_2 += gap * gap
+    return edge_px * edge_px / max(distance_2, near * near)  # nothing is drawn in front of near
 
 
 @njit(nogil=True, cache=True)
@@ -157,13 +227,7 @@ def _cut(
         n_drawn[cell] = 0
         visible = bits[cell >> 3] >> (cell & 7) & 1
         if visible and (cell == 0 or n_drawn[parent[cell]] == _EXPANDED):
-            edge_px = edge[level[cell]] * focal_px
-            half = 0.5 * edge[level[cell]]
-            distance_2 = 0.0
-            for axis in range(3):
-                gap = max(0.0, abs(centers[cell, axis] - eye[axis]) - half)
-                distance_2 += gap * gap
-            n_pixels = edge_px * edge_px / max(distance_2, near * near)  # nothing is drawn in front of near
+            n_pixels = _projected_pixels(centers, cell, edge[level[cell]], eye, near, focal_px)
             is_leaf = first_child[cell] < 0
             is_small = n_pixels <= pixel_threshold * pixel_threshold
             if stratified:
@@ -182,6 +246,50 @@ def _cut(
         cell += 1
     n_drawn[window_end:] = 0
     return n_cut
+
+
+@njit(nogil=True, cache=True)
+def _take_pools(
+    pooled,
+    first,
+    worth,
+    most_pixels,
+    centers,
+    level,
+    n_points,
+    edge,
+    eye,
+    near,
+    focal_px,
+    strided,
+    max_range,
+    n_drawn,
+    entries,
+):
+    """Set ``n_drawn`` to ``_POOLED`` and fill ``entries`` for cells that are drawn in that form; number of entries.
+
+    pooled, first : as of ``PooledForms``.  worth : points of a range above which the form is drawn.
+    """
+    last, end = -1, -1
+    for i in range(len(pooled)):
+        cell = pooled[i]
+        n = n_drawn[cell]
+        if n <= 0:
+            continue
+        if strided:
+            stride = n_points[cell] // n
+            n = (n_points[cell] + stride - 1) // stride
+        if n <= worth[i] or _projected_pixels(centers, cell, edge[level[cell]], eye, near, focal_px) > most_pixels:
+            continue
+        n_drawn[cell] = _POOLED
+        n = first[i + 1] - first[i]
+        if first[i] == end and entries[last].range + n <= max_range:
+            entries[last].range += n
+        else:
+            last += 1
+            entries[last].offset, entries[last].range, entries[last].stride = first[i], n, 0
+        end = first[i + 1]
+    return last + 1
 
 
 @njit(nogil=True, cache=True)

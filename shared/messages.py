@@ -99,9 +99,19 @@ class RenderPoints:
 
     @property
     def n_points(self) -> int:
-        """Number of points the entries draw."""
-        stride = np.maximum(self.entries["stride"].astype(np.int64), 1)
-        return int(((self.entries["range"].astype(np.int64) + stride - 1) // stride).sum())
+        """Number of points the entries draw, pooled ones included."""
+        return int(points_of(self.entries).sum())
+
+    @property
+    def n_pooled(self) -> int:
+        """Number of pooled points the entries draw."""
+        return int(self.entries["range"][self.entries["stride"] == 0].sum(dtype=np.int64))
+
+
+def points_of(entries: np.ndarray) -> np.ndarray:
+    """(m,) int64: points that each of (m,) RENDER_POINT entries draws."""
+    stride = np.maximum(entries["stride"].astype(np.int64), 1)
+    return (entries["range"].astype(np.int64) + stride - 1) // stride
 
 
 @dataclass(frozen=True)

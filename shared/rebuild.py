@@ -64,7 +64,7 @@ def rebuild_in_order(scene: Scene, point_order: str, path: Path, progress: Progr
     if info.point_order == point_order:
         return scene
     up = up_vector(info)
-    kept = ("points_per_cell", "max_depth", "flatness", "splats", "features")
+    kept = ("points_per_cell", "max_depth", "flatness", "splats", "features", "pools", "pool_bits", "n_pools")
     settings = BuildSettings(
         point_order=point_order,
         **{key: info.build[key] for key in kept if isinstance(info.build.get(key), int | float)},

@@ -33,6 +33,7 @@ class Axis:
 
 COSTS = (
     Axis("frame_ms", "frame time, ms (median)", ("sampling", "render", "culling")),
+    Axis("read_bytes", "bytes of points read a frame", ("sampling", "culling", "positions")),
     Axis("message_bytes", "message bytes a frame (between ranks)", ("sampling", "culling")),
     Axis("frame_bytes", "bytes a frame (messages + picture)", ("sampling", "render", "culling", "image")),
     Axis("position_bytes", "bytes a position (resident)", ("positions",)),
@@ -58,6 +59,8 @@ COLUMNS = {
     "render_ms": "render ms",
     "encode_ms": "encode ms",
     "points": "points drawn",
+    "pooled_points": "from pools",
+    "read_bytes": "bytes read",
     "message_bytes": "message bytes",
     "picture_bytes": "picture bytes",
     "flip": "FLIP",
@@ -74,6 +77,8 @@ _LEGEND = (
     "positions are the stored ones, within 2⁻²⁵ of a block's edge of the source's. "
     "Frame time: culling, sampling and drawing by one rank, warm, mean over the cameras; median and quartiles of "
     "the repeats. Encoding is timed apart, errors are computed in a pass of their own. "
+    "Bytes read: positions and colours of the points of a frame; of those from pools, vertices, translations, tags, "
+    "palettes and a byte of colour each. "
     "Bytes a frame: camera (twice), visibility bits and render-points as sent, and the encoded picture. "
     "Errors are means over the cameras. FLIP (0…1, 67 pixels a degree), SSIM (Gaussian window, σ = 1.5 px) and "
     "PSNR (range 255, 100 dB where equal) are of the whole picture; foreground PSNR, holes and false pixels (shares) "
@@ -130,7 +135,7 @@ def _section(row: Row) -> str:
 def _front_names(rows: list[Row]) -> list[str]:
     """For each row, the costs in whose diagram against FLIP it is on the front."""
     names: list[list[str]] = [[] for _ in rows]
-    for cost, name in zip(COSTS, ("time", "message bytes", "bytes", "position bytes"), strict=True):
+    for cost, name in zip(COSTS, ("time", "bytes read", "message bytes", "bytes", "position bytes"), strict=True):
         drawn = [i for i, row in enumerate(rows) if _section(row) in cost.sections]
         for i in pareto_front([rows[i][cost.column] for i in drawn], [rows[i]["flip"] for i in drawn]):
             names[drawn[i]].append(name)

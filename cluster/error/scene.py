@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from ...nodes.culling import CullingNode
+from ...nodes.pooled_entries import PooledForms
 from ...nodes.raster import ResidentPoints
 from ...nodes.raster.fixed_point import fixed_point
 from ...nodes.render import RenderNode, Wanted, load_points
@@ -31,17 +32,28 @@ STAGES = ("culling", "sampling", "render")
 
 @dataclass(frozen=True)
 class Pipeline:
-    """Culling, sampling and render node of one point, called one after the other in this process."""
+    """Culling, sampling and render node of one point, called one after the other in this process.
+
+    forms : the pooled forms of its scene.  position_bytes : of a position as it is read, but from pools.
+    colour_bytes : of a point's colour.
+    """
 
     culling: CullingNode
     sampling: SamplingNode
     render: RenderNode
+    forms: PooledForms
+    position_bytes: float
+    colour_bytes: int
 
     def draw(self, camera: Camera) -> tuple[VisibilityBits, RenderPoints, np.ndarray]:
         """The messages of a frame, and its words, which are valid until the next call."""
         bits = self.culling.process(camera)
         chosen = self.sampling.process(camera, bits)
         return bits, chosen, self.render.process(camera, chosen)
+
+    def read_bytes(self, chosen: RenderPoints) -> float:
+        """Bytes of points that drawing a frame reads."""
+        return self.forms.read_bytes(chosen.entries, self.position_bytes + self.colour_bytes)
 
     def timed_draw(self, camera: Camera) -> list[float]:
         """Seconds of each of ``STAGES`` for one frame."""
@@ -60,6 +72,7 @@ class _Loaded:
 
     scene: Scene
     octree: Octree
+    forms: PooledForms
     points: ResidentPoints
 
 
@@ -97,8 +110,9 @@ class SweptScene:
                 path = self._folder / "scenes" / f"{self.name}-{order}.scene"
                 scenes[order] = rebuild_in_order(own, order, path, progress.show)
             scene = scenes[order]
+            octree = scene.octree(features=wanted.features, pools=wanted.pools)
             points = load_points(scene, self._colouring, wanted, verify=self._job.config.scene.verify)
-            self._loaded[order, wanted] = _Loaded(scene, scene.octree(), points)
+            self._loaded[order, wanted] = _Loaded(scene, octree, PooledForms.of(octree), points)
 
     @contextmanager
     def open(self, point: SweepPoint) -> Iterator[Pipeline]:
@@ -109,7 +123,14 @@ class SweptScene:
         if bits:
             points = fixed_point(points, loaded.scene.info.edge, bits)
         with job.make_rasterizer(points) as rasterizer:
-            yield Pipeline(job.culling_node(loaded.octree), job.sampling_node(loaded.octree), RenderNode(rasterizer))
+            yield Pipeline(
+                job.culling_node(loaded.octree),
+                job.sampling_node(loaded.octree),
+                RenderNode(rasterizer),
+                loaded.forms,
+                3 * bits / 8 if bits else job.position_bytes,
+                job.colour_bytes,
+            )
 
     def references(self, progress: FrameProgress) -> list[np.ndarray]:
         """(height, width) uint64 words of the reference frame of each camera."""

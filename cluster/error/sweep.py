@@ -23,9 +23,6 @@ from .config import ErrorConfig, SweepPoint
 from .picture import decode_picture, encode_picture
 from .scene import STAGES, Pipeline, SweptScene
 
-FLOAT32_BYTES = 12
-"""Three coordinates as they are stored."""
-
 
 @dataclass(frozen=True)
 class Omission:
@@ -147,12 +144,11 @@ def _errors(scene: SweptScene, point: SweepPoint, references: list[np.ndarray]) 
             _frame_errors(scene, point, pipeline, camera, reference)
             for camera, reference in zip(scene.cameras, references, strict=True)
         ]
-    means = {}
-    for name in frames[0]:
-        values = [value for frame in frames if (value := frame[name]) is not None]
-        means[name] = sum(values) / len(values) if values else None
-    bits = point.config.positions.bits_per_axis
-    return {"position_bytes": 3 * bits / 8 if bits else FLOAT32_BYTES, **means}
+        means = {}
+        for name in frames[0]:
+            values = [value for frame in frames if (value := frame[name]) is not None]
+            means[name] = sum(values) / len(values) if values else None
+        return {"position_bytes": pipeline.position_bytes, **means}
 
 
 def _frame_errors(
@@ -169,6 +165,8 @@ def _frame_errors(
     rmse, similarity = metrics.rmse(wanted, found), metrics.ssim(wanted, found)
     return {
         "points": chosen.n_points,
+        "pooled_points": chosen.n_pooled,
+        "read_bytes": pipeline.read_bytes(chosen),
         "entries": len(chosen.entries),
         "message_bytes": message_bytes,
         "picture_bytes": len(encoded),

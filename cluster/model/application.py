@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ...nodes.pooled_entries import PooledForms
 from ...nodes.raster.reference import covered_pixels
 from ...shared.config import load_config
 from ...shared.messages import HEADER, RENDER_POINT, encode
@@ -48,7 +49,7 @@ def measured_application(
     run, overrides : of ``instrumented_run``.  found : of ``measure_ranks``.
     """
     job = Job(load_config(config, overrides))
-    octree = job.scene.octree()
+    octree = job.load_octree()
     per_frame = run["per_frame"]
     gpu = run["rasterizer"].startswith("gl")
     entries_bytes = max(per_frame["entries"]) * RENDER_POINT.itemsize
@@ -108,7 +109,7 @@ def _fragments(job: Job, octree: Octree, frame: int) -> int:
     camera = job.camera(frame)
     chosen = job.sampling_node(octree).process(camera, job.culling_node(octree).process(camera))
     points = job.load_points(verify=False)
-    return covered_pixels(points, camera, chosen.entries, job.point_size)
+    return covered_pixels(points, camera, PooledForms.of(octree).as_ranges(octree, chosen.entries), job.point_size)
 
 
 def _traffic(run: dict[str, Any], job: Job, bits_bytes: int, entries_bytes: int) -> tuple[Traffic, ...]:

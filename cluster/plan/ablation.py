@@ -163,7 +163,7 @@ class _Bench:
     def __init__(self, job: Job, stack: ExitStack) -> None:
         self.job = job
         self.stack = stack
-        self.octree = job.scene.octree()
+        self.octree = job.load_octree()
         self.culling = job.culling_node(self.octree)
         self.sampling = job.sampling_node(self.octree)
         self._entries: dict[int, np.ndarray] = {}

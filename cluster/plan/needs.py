@@ -48,6 +48,7 @@ def parts(job: Job, work: Workload, decision: Decision) -> list[Part]:
         _splat_loop(job, work),
         _adaptive_size(job, work),
         _compact_positions(job),
+        _pools(job, work),
         _splats(job, work),
         _quads(job, work),
         _colour(job),
@@ -184,6 +185,20 @@ def _compact_positions(job: Job) -> Part:
     return Part(
         "compact positions", True, "render.positions is float32: drawn as they are stored", cost_s, "s of loading"
     )
+
+
+def _pools(job: Job, work: Workload) -> Part:
+    size_mb = 1e-6 * job.scene.info.pool_bytes or None
+    if job.pools == "off":
+        return Part("pools", True, job.why_no_pools, size_mb, "MB read", "counted")
+    share = work.pooled_points / max(work.points, 1)
+    why = f"sampling.pools is {job.pools}: {share:.0%} of the points are drawn from them"
+    if work.owners:
+        why += (
+            f"; {work.pooled_cells:.0f} of {work.owners:.0f} cells have them, in the others they are not a quarter"
+            " smaller than points of three bytes"
+        )
+    return Part("pools", False, why, size_mb, "MB read", "counted")
 
 
 def _splats(job: Job, work: Workload) -> Part:

@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from ...nodes.pooled_entries import PooledForms
 from ..job import Job
 from ..record import FrameCounts
 
@@ -23,6 +24,8 @@ class Workload:
     """Counts and seconds of an average frame.
 
     cells : of the octree.  cells_visible, entries, points : what culling lets through, what sampling asks for.
+    pooled_points : of those, from pools.  owners, pooled_cells : cells that own points, and those of them that have a
+    pooled form; counted in a look.
     pixels : drawn.  culling_s, sampling_s : measured on this machine.
     render_s : measured where a run has drawn, else None.
     """
@@ -35,6 +38,9 @@ class Workload:
     culling_s: float
     sampling_s: float
     render_s: float | None = None
+    pooled_points: float = 0.0
+    owners: float = 0.0
+    pooled_cells: float = 0.0
 
     @classmethod
     def of_look(cls, job: Job) -> Workload:
@@ -42,7 +48,7 @@ class Workload:
 
         Cost: the octree loaded once, and those frames' culling and sampling.
         """
-        octree = job.scene.octree()
+        octree = job.load_octree()
         culling, sampling = job.culling_node(octree), job.sampling_node(octree)
         sampling.process(job.camera(0), culling.process(job.camera(0)))  # compiles, or loads what was compiled
         counts, rows = FrameCounts(), []
@@ -54,12 +60,20 @@ class Workload:
             rows.append((culling_s, sampling_s))
         culling_s, sampling_s = np.mean(rows, axis=0).tolist()
         mean = {name: float(np.mean(values)) for name, values in counts.lists().items()}
-        return cls(cells=len(octree), pixels=_pixels(job), culling_s=culling_s, sampling_s=sampling_s, **mean)
+        return cls(
+            cells=len(octree),
+            pixels=_pixels(job),
+            culling_s=culling_s,
+            sampling_s=sampling_s,
+            owners=len(octree.owners),
+            pooled_cells=len(PooledForms.of(octree)),
+            **mean,
+        )
 
     @classmethod
     def of_run(cls, job: Job, per_frame: dict[str, Any]) -> Workload:
         """Of every frame of a run, from the lists of its ``run.json``."""
-        names = ("cells_visible", "entries", "points", "culling_s", "sampling_s", "render_s")
+        names = ("cells_visible", "entries", "points", "pooled_points", "culling_s", "sampling_s", "render_s")
         mean = {name: float(np.mean(per_frame[name])) for name in names}
         return cls(cells=job.scene.info.n_cells, pixels=_pixels(job), **mean)
 

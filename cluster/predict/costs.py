@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from ...nodes.raster.cpu import MERGED_PIXELS_PER_POINT
+from ...nodes.raster.framebuffers import MERGED_PIXELS_PER_POINT
 from ...shared.config import RunConfig
 from ...shared.errors import InputError
 from ...shared.views import VIEWS_PER_PICTURE

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from ...nodes.cell_blocks import cell_blocks, cell_spacing
+from ...nodes.pooled_entries import PooledForms
+from ...nodes.sampling import POOLED_POINT_COST
 from ...shared.camera import Camera
-from ...shared.messages import HEADER, RenderPoints, encode
+from ...shared.messages import HEADER, encode, points_of
 from ...shared.octree import Octree
 from ..job import Job
 from ..record import FrameCounts
@@ -32,7 +33,8 @@ class Workload:
     """Counts of one run. Arrays are (n_frames,) float64; a frame is a view of a picture.
 
     cells : of the octree.
-    cells_visible, entries, points : a frame's bits set, render-points entries, points drawn.
+    cells_visible, entries, points : a frame's bits set, render-points entries, points drawn, a pooled one as
+    ``POOLED_POINT_COST`` points.
     cold : of the points, those among the first ``COLD_POINTS`` of an entry.
     covered : pixels that the frame's points write, each as often as it is written.
     pixels : drawn a frame.
@@ -71,26 +73,31 @@ class Workload:
 
 def count_workload(job: Job) -> Workload:
     """The workload of a job. Cost: culling and sampling of each frame, a few milliseconds."""
-    octree = job.scene.octree()
+    octree = job.load_octree()
+    forms = PooledForms.of(octree)
     culling, sampling = job.culling_node(octree), job.sampling_node(octree)
     spacing = _Spacing(job, octree) if job.point_size.adaptive else None
     counts = FrameCounts()
-    cold, covered, sizes = np.zeros((3, job.n_frames))
+    points, cold, covered, sizes = np.zeros((4, job.n_frames))
     for frame in range(job.n_frames):
         camera = job.camera(frame)
         bits = culling.process(camera)
         chosen = sampling.process(camera, bits)
         counts.add(bits, chosen)
-        cold[frame] = np.minimum(_counts(chosen.entries), COLD_POINTS).sum()
-        covered[frame] = chosen.n_points * _pixels_per_point(job, spacing, camera, chosen)
+        cold[frame] = np.minimum(points_of(chosen.entries), COLD_POINTS).sum()
+        points[frame] = chosen.n_points + (POOLED_POINT_COST - 1) * chosen.n_pooled
+        covered[frame] = points[frame] * _pixels_per_point(
+            job, spacing, camera, forms.as_ranges(octree, chosen.entries)
+        )
         head, payload = encode(chosen)
         sizes[frame] = len(head) + len(payload)
     pixels = job.views.width * job.views.height
     bits_bytes = HEADER.size + (len(octree) + 7) // 8
-    counted = {name: np.array(values, np.float64) for name, values in counts.lists().items()}
+    counted = {name: np.array(counts.lists()[name], np.float64) for name in ("cells_visible", "entries")}
     return Workload(
         cells=len(octree),
         pixels=pixels,
+        points=points,
         cold=cold,
         covered=covered,
         visibility_bytes=bits_bytes,
@@ -116,12 +123,12 @@ class _Spacing:
         return self._spacing[np.searchsorted(self._first, index, side="right") - 1]
 
 
-def _pixels_per_point(job: Job, spacing: _Spacing | None, camera: Camera, chosen: RenderPoints) -> float:
+def _pixels_per_point(job: Job, spacing: _Spacing | None, camera: Camera, entries: np.ndarray) -> float:
     """Mean square of the points' sides, pixels²; from an even sample of them where sides depend on distance."""
     size = job.point_size
-    if not (size.world or spacing) or not chosen.n_points:
+    if not (size.world or spacing) or not len(entries):
         return float(size.pixels**2)
-    index = _sample(chosen.entries, chosen.n_points)
+    index = _sample(entries)
     x, y, z = (np.asarray(column[index], np.float64) for column in job.scene.positions())
     first, origin = job.scene.blocks()
     world = origin[np.searchsorted(first, index, side="right") - 1] + np.column_stack([x, y, z])
@@ -132,16 +139,12 @@ def _pixels_per_point(job: Job, spacing: _Spacing | None, camera: Camera, chosen
     return float(np.where(inside, np.rint(side) ** 2, 0).mean())
 
 
-def _sample(entries: Any, n_points: int) -> np.ndarray:
-    """Indices into the point-array of up to ``SAMPLED_POINTS`` of the chosen points, evenly spread over them."""
-    ordinal = np.linspace(0, n_points - 1, min(n_points, SAMPLED_POINTS)).astype(np.int64)
-    counts = _counts(entries)
+def _sample(entries: np.ndarray) -> np.ndarray:
+    """Indices into the point-array of up to ``SAMPLED_POINTS`` of the points of ranges, evenly spread over them."""
+    counts = points_of(entries)
     ends = np.cumsum(counts)
+    n_points = int(ends[-1])
+    ordinal = np.linspace(0, n_points - 1, min(n_points, SAMPLED_POINTS)).astype(np.int64)
     entry = np.searchsorted(ends, ordinal, side="right")
     stride = entries["stride"][entry].astype(np.int64)
     return entries["offset"][entry].astype(np.int64) + (ordinal - (ends - counts)[entry]) * stride
-
-
-def _counts(entries: Any) -> np.ndarray:
-    """(m,) int64: points that each of (m,) RENDER_POINT entries draws."""
-    return -(-entries["range"].astype(np.int64) // entries["stride"].astype(np.int64))

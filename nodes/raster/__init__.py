@@ -17,6 +17,7 @@ from ...shared.errors import InputError, MessageError
 
 if TYPE_CHECKING:
     from .group_raster import ResidentGroups
+    from .pools import PoolCells
 
 MAX_SIDE_PX = 1 << 15
 """Largest side of a point's square, and of the viewport of ``cpu``: pixel indices stay within int32."""
@@ -56,6 +57,8 @@ class ResidentPoints:
     block_spacing : (b,) float32, side of squares that leave no gap between the points of each block, world units:
         adaptive point size. Blocks are single cells then.
     features : what cells look like: feature-driven splats.
+    pools : cells in pooled form, in stored order; their ``world_side`` is their spacing as of ``block_spacing``, else
+        0. No point may be filtered out then.
     """
 
     x: np.ndarray
@@ -69,6 +72,7 @@ class ResidentPoints:
     root_edge: float = 1.0
     block_spacing: np.ndarray | None = None
     features: CellFeatures | None = None
+    pools: PoolCells | None = None
 
     def __len__(self) -> int:
         return len(self.x)
@@ -137,7 +141,8 @@ class Rasterizer(Protocol):
     def draw(self, camera: Camera, entries: np.ndarray) -> np.ndarray:
         """(height, width) uint64 framebuffer words, row 0 on top; valid until the next call.
 
-        entries : (m,) RENDER_POINT.  Raises MessageError for an entry beyond the point-array or with stride 0.
+        entries : (m,) RENDER_POINT.  Raises MessageError for an entry beyond the point-array, and for pooled points
+        (stride 0) that are not there, or that it does not draw.
         """
         ...
 

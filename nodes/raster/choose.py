@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 
 RASTERIZERS = ("auto", "cpu", "gl", "gl-points")
 DRAW_POOLS = ("cpu",)
+"""Those that draw pooled points."""
 
 
 def make_rasterizer(
@@ -75,9 +76,9 @@ def check_style(name: str, splats: SplatSettings | None, *, groups: bool = False
         raise ConfigError("render.rasterizer = 'gl-points' draws no splats, expected auto, cpu or gl")
 
 
-def draws_pools(name: str, splats: SplatSettings | None) -> bool:
-    """Whether the rasterizer of this name draws pooled points."""
-    return splats is None and resolve_rasterizer(name) in DRAW_POOLS
+def draws_pools(name: str) -> bool:
+    """Whether the rasterizer of points of this name draws pooled ones."""
+    return resolve_rasterizer(name) in DRAW_POOLS
 
 
 def resolve_rasterizer(name: str) -> str:

@@ -11,8 +11,8 @@ import numpy as np
 from ...shared.camera import Camera
 from . import PointSize, ResidentPoints, kernels, world_sides
 from .blocks import Blocks
-from .framebuffers import FramebufferRasterizer
-from .pieces import split_entries
+from .framebuffers import FramebufferRasterizer, Kernel
+from .pieces import split_entries, split_forms
 from .threads import read_only
 
 PIECE_POINTS = 1 << 14
@@ -22,7 +22,8 @@ PIECE_POINTS = 1 << 14
 class CpuRasterizer(FramebufferRasterizer):
     """Draws a resident point-array on the CPU; a context manager that owns its threads and framebuffers.
 
-    points : the render rank's half of a scene. Not modified, not copied if its arrays have the documented dtypes.
+    points : the render rank's half of a scene. Not modified, not copied if its arrays have the documented dtypes. Pools
+        are drawn if it has them.
     width, height : viewport, 1…32768 px.
     threads : at most this many; None: all cores this process may run on.
     compact : hold positions in fixed point (``compact``) instead of using those given. Needs finite positions; frames
@@ -67,21 +68,33 @@ class CpuRasterizer(FramebufferRasterizer):
         self._blocks = Blocks(
             np.ascontiguousarray(points.block_origin, np.float64), world_sides(points, size), lower, step
         )
+        self._first_pooled, self._draw_pools = np.zeros(1, np.int64), None
+        if points.pools:
+            from .pools import draw_pools, sized
+
+            self._first_pooled = points.pools.first_point
+            self._draw_pools = partial(draw_pools, sized(points.pools, size))
 
     def draw(self, camera: Camera, entries: np.ndarray) -> np.ndarray:
         """(height, width) uint64 framebuffer words, row 0 on top; valid until the next call.
 
-        entries : (m,) RENDER_POINT.  Raises MessageError for an entry beyond the point-array or with stride 0, and
-        for a camera of another viewport.
+        entries : (m,) RENDER_POINT.  Raises MessageError for an entry beyond the point-array, for pooled points that
+        are not there or not whole cells, and for a camera of another viewport.
         """
+        entries, cells = split_forms(entries, self._first_pooled)
         pieces = split_entries(entries, self._block_first_point, self._n_points, PIECE_POINTS)
-        kernel = partial(kernels.draw, self._points, self._blocks, pieces)
-        return self._draw_frame(camera, int(pieces["count"].sum(dtype=np.int64)), (kernel, len(pieces)))
+        n_points = int(pieces["count"].sum(dtype=np.int64))
+        work: list[tuple[Kernel, int]] = [(partial(kernels.draw, self._points, self._blocks, pieces), len(pieces))]
+        if self._draw_pools:
+            n_points += int((self._first_pooled[cells + 1] - self._first_pooled[cells]).sum())
+            work.append((partial(self._draw_pools, cells), len(cells)))
+        return self._draw_frame(camera, n_points, *work)
 
 
-def kernels_cached() -> bool:
+def kernels_cached(pools: bool = False) -> bool:
     """Whether the first frame will load the kernels instead of compiling them (some seconds).
 
+    pools : whether pools are drawn, too.
     True if the compiled files are younger than the source, as far as numba's cache folder tells.
     """
     from . import pieces
@@ -91,4 +104,9 @@ def kernels_cached() -> bool:
         index = folder.glob(f"{source.stem}.{kernel.py_func.__qualname__}-*.nbi")
         return any(file.stat().st_mtime > source.stat().st_mtime for file in index)
 
-    return all(map(cached, (kernels.draw, kernels.merge, pieces._split)))
+    needed = [kernels.draw, kernels.merge, pieces._split]
+    if pools:
+        from .pools import draw_pools
+
+        needed.append(draw_pools)
+    return all(map(cached, needed))

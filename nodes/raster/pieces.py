@@ -16,7 +16,7 @@ PIECE = np.dtype([("first", "<i8"), ("count", "<u4"), ("stride", "<u4"), ("segme
 
 
 def check_entries(entries: np.ndarray, n_points: int) -> None:
-    """Raise MessageError for an entry beyond the point-array or with stride 0. Cost: O(m)."""
+    """Raise MessageError for an entry beyond the point-array or with stride 0, pooled points. Cost: O(m)."""
     limit = np.uint64(n_points)
     offset, length, stride = entries["offset"], entries["range"].astype(np.uint64), entries["stride"]
     bad = (stride == 0) | (offset > limit) | (length > limit - np.minimum(offset, limit))
@@ -26,6 +26,33 @@ def check_entries(entries: np.ndarray, n_points: int) -> None:
             f"render-points entry {i}: found offset {offset[i]}, range {length[i]}, stride {stride[i]}, "
             f"expected a range within {n_points} points and a stride ≥ 1"
         )
+
+
+def split_forms(entries: np.ndarray, first_pooled: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(r,) RENDER_POINT: those of (m,) entries that are ranges; (k,) int64: the pooled cells that the others name.
+
+    first_pooled : (c + 1,) int64, ascending from 0: number of the first pooled point of each cell, and of them all.
+    Raises MessageError for pooled points that are not there, or are not whole cells.  Cost: O(m log c + k).
+    """
+    pooled = entries["stride"] == 0
+    if not pooled.any():
+        return entries, np.empty(0, np.int64)
+    which = np.flatnonzero(pooled)
+    offset, length = entries["offset"][which], entries["range"][which].astype(np.uint64)
+    borders = first_pooled.view(np.uint64)
+    begin = np.minimum(offset, borders[-1])
+    end = np.minimum(begin + length, borders[-1])
+    first, last = np.searchsorted(borders, [begin, end])
+    good = (begin == offset) & (end - begin == length) & (borders[first] == begin) & (borders[last] == end)
+    if not good.all():
+        i = int(good.argmin())
+        raise MessageError(
+            f"render-points entry {which[i]}: found offset {offset[i]}, range {length[i]}, stride 0, "
+            f"expected whole cells within {borders[-1]} pooled points"
+        )
+    count = last - first
+    start = np.cumsum(count) - count
+    return entries[~pooled], np.arange(count.sum()) + np.repeat(first - start, count)
 
 
 def split_entries(entries: np.ndarray, segment_first: np.ndarray, n_points: int, limit: int) -> np.ndarray:

@@ -28,6 +28,7 @@ from numba.extending import intrinsic
 
 from ...shared.codecs.pools import TAG_BITS
 from ...shared.codecs.streams import MOST_TRANSLATIONS, PooledPoints
+from . import PointSize
 from .atomic import fetch_add
 from .kernels import BATCH, _pack, _project, _take_pixels, _take_squares
 
@@ -116,6 +117,12 @@ def pool_cells(cells: Sequence[PoolCell]) -> PoolCells:
         joined([pool.tags.ravel() for pool in pools], np.uint32),
         np.ascontiguousarray(joined([points.loose for points in held], np.uint8, 3).T),
     )
+
+
+def sized(pools: PoolCells, size: PointSize) -> PoolCells:
+    """The cells with the sides of their points' squares; they come with the spacing of their points, or 0."""
+    side = np.maximum(pools.world_side, size.world) if size.adaptive else np.full(len(pools.step), float(size.world))
+    return pools._replace(world_side=side)
 
 
 def _lowest_bit_intrinsic(_context: Any, word: Any) -> Any:
