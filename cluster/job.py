@@ -68,6 +68,7 @@ class Job:
         )
         self.wanted.check(self.scene)
         check_style(render.rasterizer, self.splats)
+        self.coded = render.positions == "coded"
         self.background = parse_colour(render.background, "render.background")
         self.colouring = Colouring.choose(
         self.why_no_pools = self._why_no_pools()
