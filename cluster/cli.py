@@ -125,6 +125,7 @@ def synth(
     seed: Annotated[int, typer.Option(help="Another seed, another city.")] = 1,
     splats: Annotated[bool, typer.Option("--splats", help="As for `splatpipe build`.")] = False,
     features: Annotated[bool, typer.Option("--features", help="As for `splatpipe build`.")] = False,
+    pools: Annotated[bool, typer.Option("--pools", help="As for `splatpipe build`.")] = False,
     overwrite: Annotated[bool, typer.Option(help="Replace an existing scene.")] = False,
 ) -> None:
     """Make a synthetic city scan: a scene directory, or a LAS/LAZ file.
@@ -134,7 +135,8 @@ def synth(
     from ..shared.build import BuildSettings
     from .scenes import synth_command
 
-    synth_command(output, points, seed, BuildSettings(overwrite=overwrite, up="z", splats=splats, features=features))
+    settings = BuildSettings(overwrite=overwrite, up="z", splats=splats, features=features, pools=pools)
+    synth_command(output, points, seed, settings)
 
 
 @app.command()

@@ -15,6 +15,7 @@ from ..shared.build import BuildReport, BuildSettings, build_scene
 from ..shared.errors import InputError
 from ..shared.files import write_json
 from ..shared.octree import FEATURES
+from ..shared.pooled import PoolCounts
 from ..shared.readers import expand_inputs, open_source
 from ..shared.store import Scene
 from .progress import FrameProgress
@@ -91,6 +92,10 @@ def _scene_info(path: Path) -> dict[str, Any]:
         assert feature is not None
         count = np.bincount(feature, minlength=len(FEATURES))
         info["features"] = [f"{n:,} {name}" for name, n in zip(FEATURES, count, strict=True)]
+    if scene.info.pool_bits:
+        info["pooled_cells"] = PoolCounts.of(scene.octree(pools=True)).texts()
+    else:
+        info["pooled_cells"] = "none: built without --pools"
     info["sources"] = [f"{source['name']} ({source['n_points']:,})" for source in info["sources"]]
     return {"scene": str(path), **info, "bytes": size}
 

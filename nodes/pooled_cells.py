@@ -10,7 +10,7 @@ import numpy as np
 from ..shared.codecs.order import distinct, sorted_order
 from ..shared.codecs.palette import to_palette
 from ..shared.errors import StoreError
-from ..shared.pooled import PooledCell, grid_keys, pooled_cells, read_pooled
+from ..shared.pooled import CellGrid, PooledCell, pooled_cells, read_pooled
 from ..shared.store import Scene
 from .raster import ResidentPoints
 from .raster.pools import PoolCell, PoolCells, pool_cells
@@ -36,8 +36,8 @@ def _load(scene: Scene, codes: np.ndarray, points: ResidentPoints, cell: PooledC
     bits = scene.info.pool_bits
     own = slice(cell.first_point, cell.first_point + cell.n_points)
     block = np.searchsorted(points.block_first_point, cell.first_point, side="right") - 1
-    offset = points.block_origin[block] - cell.lower
-    first = _first_of(keys, grid_keys((points.x[own], points.y[own], points.z[own]), offset, cell.edge, bits), bits)
+    grid = CellGrid(points.block_origin[block] - cell.lower, cell.edge, bits)
+    first = _first_of(keys, grid.keys((points.x[own], points.y[own], points.z[own])), bits)
     if first is None:
         raise StoreError(
             f"{scene.path}/pool_codes.npy: cell {cell.cell}: found a pooled point that is not one of the cell's"

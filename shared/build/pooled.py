@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
 from ..codecs import streams
+from ..codecs.autocorrelation import FLOAT32_POINTS, MAX_REACH
 from ..octree import cell_centers
-from ..pooled import Columns, grid_keys, grid_points
+from ..pooled import LEAST_POINTS, CellGrid, points_of
 from .parallel import Workers
-from .settings import BuildSettings
+from .settings import BuildSettings, available_memory_bytes, resident_bytes
 from .writer import SceneWriter, writing
 
-_CHUNK = 1 << 18
-_CELLS = 64
-"""Cells of a thread that are encoded before their codes are written."""
+_CELLS = 32
+"""Cells a thread that are encoded before their codes are written."""
+_POINT_BYTES = 100
+"""A distinct grid point while its cell is encoded: table, tags and order."""
 
 
 def suited_bits(points_per_cell: int) -> int:
@@ -29,7 +31,7 @@ def pool_positions(
     edge: float,
     block_first_point: np.ndarray,
     block_origin: np.ndarray,
-    columns: Columns,
+    columns: Callable[[int, int], Iterable[np.ndarray]],
     bits: int,
     settings: BuildSettings,
     writer: SceneWriter,
@@ -38,46 +40,52 @@ def pool_positions(
 ) -> dict[str, np.ndarray]:
     """Write ``pool_codes``; the new cell arrays ``cell_pool_points`` and ``cell_pool_bytes``.
 
-    columns : positions as they will be read from the scene.  progress : called with the points done, and in all.
+    columns : x, y, z of a range of the points as they will be read from the scene.
+    progress : called with the points done, and in all.
+    Cost: about 10 µs a point and core, more on grids of more bits. Memory: cells at the same time on as many threads as
+    ``settings.memory_bytes`` has room for, one at least.
     """
-    n = len(cells["cell_level"])
-    first, count = cells["cell_first_point"], cells["cell_n_points"]
-    pool_points, pool_bytes = np.zeros(n, np.uint32), np.zeros(n, np.uint32)
-    owners = np.flatnonzero(count if settings.point_order == "layered" else cells["cell_first_child"] < 0)
-    owners = owners[np.argsort(first[owners])]
-    edges = np.ldexp(edge, -cells["cell_level"].astype(np.int64))
-    lower = cell_centers(origin, edge, cells["cell_level"], cells["cell_code"]) - edges[:, None] / 2
+    level, first, count = cells["cell_level"], cells["cell_first_point"], cells["cell_n_points"]
+    pool_points, pool_bytes = np.zeros(len(level), np.uint32), np.zeros(len(level), np.uint32)
+    owns = count > 0 if settings.point_order == "layered" else cells["cell_first_child"] < 0
+    tried = np.flatnonzero(owns & (count >= LEAST_POINTS))
+    tried = tried[np.argsort(first[tried])]
+    edges = np.ldexp(edge, -level.astype(np.int64))
+    lower = cell_centers(origin, edge, level, cells["cell_code"]) - edges[:, None] / 2
     blocks = np.searchsorted(block_first_point, first, side="right") - 1
 
     def encode(cell: int) -> tuple[np.ndarray, int] | None:
-        begin, end = int(first[cell]), int(first[cell] + count[cell])
-        offset = block_origin[blocks[cell]] - lower[cell]
-        return _encode(columns, begin, end, offset, float(edges[cell]), bits, settings.n_pools)
+        grid = CellGrid(block_origin[blocks[cell]] - lower[cell], float(edges[cell]), bits)
+        keys = grid.distinct_keys(columns, int(first[cell]), int(first[cell] + count[cell]))
+        return _encode(points_of(keys, bits), bits, settings.n_pools)
 
     codes = writer.open_column("pool_codes", np.dtype("u1"))
-    done, total = 0, int(count[owners].sum())
-    step = _CELLS * workers.n_threads
-    for start in range(0, len(owners), step):
-        some = owners[start : start + step].tolist()
-        for cell, found in zip(some, workers.map(encode, [(cell,) for cell in some]), strict=True):
-            if found is not None:
-                data, pool_points[cell] = found
-                pool_bytes[cell] = len(data)
-                with writing(writer.partial):
-                    codes.write(data)
-        done += int(count[some].sum())
-        progress(done, total)
+    done, total = 0, int(count[tried].sum())
+    most = int(count[tried].max(initial=0))
+    with Workers(_threads(most, bits, settings, workers.n_threads)) as encoders:
+        for start in range(0, len(tried), _CELLS * encoders.n_threads):
+            some = tried[start : start + _CELLS * encoders.n_threads].tolist()
+            for cell, found in zip(some, encoders.map(encode, [(cell,) for cell in some]), strict=True):
+                if found is not None:
+                    data, pool_points[cell] = found
+                    pool_bytes[cell] = len(data)
+                    with writing(writer.partial):
+                        codes.write(data)
+            done += int(count[some].sum())
+            progress(done, total)
     return {"cell_pool_points": pool_points, "cell_pool_bytes": pool_bytes}
 
 
-def _encode(
-    columns: Columns, begin: int, end: int, offset: np.ndarray, edge: float, bits: int, n_pools: int
-) -> tuple[np.ndarray, int] | None:
-    """The code of the points begin … end − 1 and the number of its points; None where it does not pay."""
-    occupied = np.zeros(8**bits, np.bool_)
-    for at in range(begin, end, _CHUNK):
-        occupied[grid_keys(columns(at, min(at + _CHUNK, end)), offset, edge, bits)] = True
-    points = grid_points(np.flatnonzero(occupied), bits)
+def _encode(points: np.ndarray, bits: int, n_pools: int) -> tuple[np.ndarray, int] | None:
+    """The code of distinct grid points and their number; None where it does not pay."""
     data = streams.encode(points, bits, n_pools).data
-    pooled = streams.read_pools(data, bits, len(points))
-    return (data, len(points)) if streams.keeps_pools(pooled) else None
+    return (data, len(points)) if streams.keeps_pools(streams.read_pools(data, bits, len(points))) else None
+
+
+def _threads(most_points: int, bits: int, settings: BuildSettings, n_threads: int) -> int:
+    """How many cells are encoded at a time, the largest one being of that many points."""
+    n_points = min(most_points, 8**bits)
+    padded = (2**bits + min(2**bits - 1, MAX_REACH)) ** 3
+    cell_bytes = padded * (16 if n_points <= FLOAT32_POINTS else 32) + _POINT_BYTES * n_points
+    left = (settings.memory_bytes or available_memory_bytes() // 2) - resident_bytes()
+    return int(np.clip(left // cell_bytes, 1, n_threads))
