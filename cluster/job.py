@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ..nodes.culling import CullingNode
 from ..nodes.picture.compose import Composer, Picture, PictureSettings
@@ -24,6 +25,7 @@ from ..shared.octree import Octree
 from ..shared.store import Scene
 from ..shared.views import camera_views
 from .sink import FrameSink, layer_name
+    from ..nodes.raster.group_raster import ResidentGroups
 
 SPLAT_COLOUR = "#d0d0d0"
 """Colour of lit splats where points have none but the shading of their normals."""
@@ -58,28 +60,30 @@ class Job:
         self.largest_point_px = largest_px if render.point_size_world or render.point_size_adaptive else smallest_px
         self.splats = SplatSettings(**dict(config.splats)) if render.style == "splats" else None
         self.compact = render.positions == "compact"
+        self.coded = render.positions == "coded"
         self.point_filter = PointFilter.choose(self.scene, config.filter.classes, config.filter.boxes)
+        self.why_no_pools = self._why_no_pools()
+        self.pools: Pools = "off" if self.why_no_pools else config.sampling.pools
         self.wanted = Wanted(
             splats=self.splats is not None,
             features=self.splats is not None and self.splats.features,
             cells=self.compact or render.point_size_adaptive,
             spacing=render.point_size_adaptive,
+            groups=self.coded,
+            pools=self.pools != "off",
             point_filter=self.point_filter,
         )
         self.wanted.check(self.scene)
-        check_style(render.rasterizer, self.splats)
-        self.coded = render.positions == "coded"
+        check_style(render.rasterizer, self.splats, groups=self.coded)
+        if self.coded and self.point_filter:
+            raise ConfigError("render.positions = 'coded': found a filter, which takes points out of their groups")
         self.background = parse_colour(render.background, "render.background")
         self.colouring = Colouring.choose(
-        self.why_no_pools = self._why_no_pools()
-        self.pools: Pools = "off" if self.why_no_pools else config.sampling.pools
             self.scene, render.colour, render.colormap, render.colour_range, render.class_colours
         )
         self.colour = self.colouring.mode if render.colour == "auto" else render.colour
         if self.splats and self.splats.lighting and self.colouring.mode == "normal":  # light falls on a splat once
             self.colouring = Colouring.choose(self.scene, SPLAT_COLOUR)
-            groups=self.coded,
-            pools=self.pools != "off",
         self.views = camera_views(config.camera, info, self.n_pictures, render.supersampling)
         self.n_frames = self.n_pictures * self.views.per_picture
         largest_px = render.supersampling * max(config.camera.width, config.camera.height)
@@ -91,22 +95,6 @@ class Job:
         if config.output.mp4 and not self.background[3]:
             raise ConfigError("render.background = 'transparent', expected a colour: a film (output.mp4) has no alpha")
 
-    def camera(self, frame: int) -> Camera:
-        """The camera of a frame."""
-        return self.views.camera(frame)
-
-    def culling_node(self, octree: Octree) -> CullingNode:
-        """The culling node of this run."""
-        margin_px = self.largest_point_px / 2 + 0.5  # a point just outside reaches in; and rounding moves it
-        return CullingNode(octree, backface=self.backface, margin_px=margin_px, point_filter=self.point_filter)
-
-    def sampling_node(self, octree: Octree) -> SamplingNode:
-        """The sampling node of this run.
-
-        Its threshold is in pixels of the picture; how many points cover a cell is counted in drawn pixels, so that each
-        of those that are averaged has points of its own.
-        """
-        points_per_pixel = self.config.sampling.points_per_pixel
     def _why_no_pools(self) -> str:
         """Why this run draws nothing from pools; empty if it may."""
         config = self.config
@@ -136,17 +124,44 @@ class Job:
         """The cells, with what the sampling node of this run needs of them. Raises StoreError."""
         return self.scene.octree(features=self.wanted.features, pools=self.wanted.pools)
 
+    def camera(self, frame: int) -> Camera:
+        """The camera of a frame."""
+        return self.views.camera(frame)
+
+    def culling_node(self, octree: Octree) -> CullingNode:
+        """The culling node of this run."""
+        margin_px = self.largest_point_px / 2 + 0.5  # a point just outside reaches in; and rounding moves it
+        return CullingNode(octree, backface=self.backface, margin_px=margin_px, point_filter=self.point_filter)
+
+    def sampling_node(self, octree: Octree) -> SamplingNode:
+        """The sampling node of this run.
+
+        Its threshold is in pixels of the picture; how many points cover a cell is counted in drawn pixels, so that each
+        of those that are averaged has points of its own.
+        """
+        points_per_pixel = self.config.sampling.points_per_pixel
         return SamplingNode(
             octree,
             pixel_threshold=self.pixel_threshold * self.config.render.supersampling,
             points_per_pixel=points_per_pixel,
+            whole_sets=self.coded,
+            pools=self.pools,
+            point_bytes=self.position_bytes + self.colour_bytes,
         )
 
     def load_points(self, *, verify: bool) -> ResidentPoints:
-        """The points of this run, with what it needs of them. Raises StoreError."""
+        """The points of this run, with what it needs of them; coded ones are decoded. Raises StoreError."""
         return load_points(self.scene, self.colouring, self.wanted, verify=verify)
 
-    def make_rasterizer(self, points: ResidentPoints) -> Rasterizer:
+    def load_drawn(self, *, verify: bool) -> ResidentPoints | ResidentGroups:
+        """The points of this run in the form it draws them from. Raises StoreError."""
+        if not self.coded:
+            return self.load_points(verify=verify)
+        from ..nodes.grouped_cells import load_groups
+
+        return load_groups(self.scene, self.colouring, self.wanted, verify=verify)
+
+    def make_rasterizer(self, points: ResidentPoints | ResidentGroups) -> Rasterizer:
         """The rasterizer of this run over ``points``; the caller closes it. Raises DeviceError."""
         render = self.config.render
         return make_rasterizer(
@@ -156,9 +171,6 @@ class Job:
             self.views.height,
             self.point_size,
             render.threads or None,
-            whole_sets=self.coded,
-            pools=self.pools,
-            point_bytes=self.position_bytes + self.colour_bytes,
             splats=self.splats,
             compact=self.compact,
         )
@@ -167,7 +179,7 @@ class Job:
     def open_render(self, progress: Callable[[str, int], None]) -> Iterator[RenderStage]:
         """The render node of this run with its points loaded, its kernels compiled and its output open."""
         progress("loading points", 0)
-        points = self.load_points(verify=self.config.scene.verify)
+        points = self.load_drawn(verify=self.config.scene.verify)
         output = self.config.output
         with ExitStack() as stack:
             rasterizer = stack.enter_context(self.make_rasterizer(points))

@@ -66,6 +66,10 @@ class LinearGroups:
         """(n, 3) float64 in coded order, in grid steps, not rounded: within ε of the grid points they stand for."""
         return self.transformed(np.eye(3, 4))
 
+    def grid_points(self) -> np.ndarray:
+        """(n, 3) uint32 in coded order: ``positions`` rounded to the grid."""
+        return np.floor(self.positions() + 0.5).astype(np.uint32)
+
     def transformed(self, target_from_grid: np.ndarray) -> np.ndarray:
         """(n, r) float64, in coded order: an (r, 4) matrix applied to the kept points, and interpolated.
 
@@ -117,7 +121,7 @@ class LinearGroupCodec:
 
     def decode(self, data: np.ndarray, bits: int, most_points: int) -> np.ndarray:
         """(n, 3) uint32 grid points, in coded order. Raises CodecError for damaged data or above ``most_points``."""
-        return np.floor(read(data, bits, most_points).positions() + 0.5).astype(np.uint32)
+        return read(data, bits, most_points).grid_points()
 
     def group(self, points: np.ndarray, bits: int) -> tuple[LinearGroups, np.ndarray]:
         """Groups of (n, 3) grid points and, as ``Encoded.order``, (n,) int64. Raises CodecError as ``encode`` does."""
