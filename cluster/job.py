@@ -25,6 +25,8 @@ from ..shared.octree import Octree
 from ..shared.store import Scene
 from ..shared.views import camera_views
 from .sink import FrameSink, layer_name
+
+if TYPE_CHECKING:
     from ..nodes.raster.group_raster import ResidentGroups
 
 SPLAT_COLOUR = "#d0d0d0"
