@@ -87,6 +87,8 @@ def _scene_info(path: Path) -> dict[str, Any]:
     info = asdict(scene.info)
     size = sum(array["bytes"] for array in info.pop("arrays").values())
     info["splats"] = scene.info.splats
+    if scene.info.coded:
+        info |= _coded_info(scene)
     if scene.info.features:
         feature = scene.octree(features=True).feature
         assert feature is not None
@@ -98,6 +100,22 @@ def _scene_info(path: Path) -> dict[str, Any]:
         info["pooled_cells"] = "none: built without --pools"
     info["sources"] = [f"{source['name']} ({source['n_points']:,})" for source in info["sources"]]
     return {"scene": str(path), **info, "bytes": size}
+
+
+def _coded_info(scene: Scene) -> dict[str, float]:
+    """What coded positions take, and how far they may lie from those of the input, an axis, world units."""
+    octree, info = scene.octree(), scene.info
+    bin_edges = np.ldexp(2 * octree.half_edges[octree.is_leaf], -info.position_bits)
+    epsilon = info.build.get("group_epsilon") if info.positions == "groups" else None
+    if isinstance(epsilon, int | float):
+        lost = bin_edges + epsilon * float(np.max(np.subtract(info.upper, info.lower)))
+    else:
+        lost = bin_edges / 2
+    return {
+        "position_bytes_per_point": round(info.position_bytes / info.n_stored, 3),
+        "position_error_coarsest_leaf": float(f"{lost.max():.3g}"),
+        "position_error_finest_leaf": float(f"{lost.min():.3g}"),
+    }
 
 
 def _file_info(path: Path) -> dict[str, Any]:

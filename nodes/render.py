@@ -77,7 +77,7 @@ class Wanted:
 
 def load_points(scene: Scene, colouring: Colouring, wanted: Wanted = Wanted(), *, verify: bool) -> ResidentPoints:
     """The render rank's half of a scene, coloured. Positions (and rgb) are mapped from the files, not copied, but for
-    x where points are filtered.
+    x where points are filtered; coded positions are decoded (``Scene.positions``).
 
     verify : hold the checksums of the arrays it reads against the scene first: one read of each.
     Raises StoreError naming the array that is damaged or that the scene was built without.

@@ -21,7 +21,7 @@ class SceneSource(Source):
     """The input points of a scene: those of its leaves, without the level-of-detail copies.
 
     Positions are the stored ones in float64, so each differs from the input's by at most 2**-25 of its block's edge
-    an axis.
+    an axis; coded ones by what their codec rounds off, and some may lie outside the bounds of the input by as much.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -38,14 +38,14 @@ class SceneSource(Source):
         )
 
     def _read(self, max_points: int, attributes: tuple[str, ...]) -> Iterator[PointBatch]:
-        columns = self._scene.positions()
+        read = self._scene.position_reader()
         kept = {name: self._scene.attribute(name) for name in attributes}
         first, origin = self._scene.blocks()
         for start, stop in leaf_ranges(self._scene):
             for begin in range(start, stop, max_points):
                 part = slice(begin, min(begin + max_points, stop))
                 block = np.searchsorted(first, np.arange(part.start, part.stop), side="right") - 1
-                positions = np.column_stack([column[part] for column in columns]) + origin[block]
+                positions = read(part.start, part.stop).T + origin[block]
                 yield PointBatch(positions, {name: np.asarray(column[part]) for name, column in kept.items()})
 
 
