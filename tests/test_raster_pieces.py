@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from splatpipe.nodes.raster.pieces import split_entries
+from splatpipe.nodes.raster.pieces import split_entries, split_forms
 from splatpipe.shared.errors import MessageError
 from splatpipe.shared.messages import RENDER_POINT
 
@@ -45,3 +45,31 @@ def test_entries_beyond_the_point_array_are_refused(bad):
     entries = np.array([(0, 10, 1), bad], RENDER_POINT)
     with pytest.raises(MessageError, match="entry 1: found offset"):
         split_entries(entries, np.array([0]), 10, 256)
+
+
+@settings(derandomize=True, max_examples=300, deadline=None)
+@given(
+    st.lists(st.integers(1, 30), max_size=8), st.lists(st.tuples(st.booleans(), st.integers(0, 8), st.integers(0, 8)))
+)
+def test_ranges_and_pooled_cells_are_told_apart(sizes, rows):
+    first_pooled = np.cumsum([0, *sizes])
+    entries, expected = [], []
+    for pooled, a, b in rows:
+        begin, end = sorted((min(a, len(sizes)), min(b, len(sizes))))
+        offset, n = first_pooled[begin], first_pooled[end] - first_pooled[begin]
+        entries.append((offset, n, 0) if pooled else (a, b, 1))
+        expected += [*range(begin, end)] if pooled else []
+    ranges, cells = split_forms(np.array(entries, RENDER_POINT), first_pooled)
+    assert cells.tolist() == expected
+    assert ranges.tolist() == [entry for entry in entries if entry[2]]
+
+
+@pytest.mark.parametrize(
+    "bad", [(0, 3, 0), (1, 9, 0), (4, 7, 0), (10, 5, 0), (10, 1, 0), (11, 0, 0), (2**64 - 1, 2, 0), (0, 2**32 - 1, 0)]
+)
+def test_pooled_points_that_are_not_whole_cells_are_refused(bad):
+    entries = np.array([(0, 10, 1), (4, 6, 0), bad], RENDER_POINT)
+    with pytest.raises(MessageError, match=f"entry 2: found offset {bad[0]}, .*whole cells within 10 pooled points"):
+        split_forms(entries, np.array([0, 4, 10]))
+    with pytest.raises(MessageError, match=r"entry 1: .*expected whole cells within 0 pooled points"):
+        split_forms(entries, np.zeros(1, np.int64))

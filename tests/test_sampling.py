@@ -1,5 +1,5 @@
-"""Sampling: equal to a plain recursive twin, the cut property, and merged entries that draw the same
-points."""
+"""Sampling: equal to a plain recursive twin, the cut property, merged entries that draw the same points, and cells drawn
+from their pooled form."""
 
 import math
 from dataclasses import replace
@@ -11,10 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from splatpipe.nodes import sampling
 from splatpipe.nodes.culling import CullingNode
-from splatpipe.nodes.sampling import SamplingNode
+from splatpipe.nodes.pooled_entries import PALETTE_BYTES, PooledForms
+from splatpipe.nodes.sampling import POOLED_POINT_COST, SamplingNode
 from splatpipe.shared.camera import look_at, perspective_camera
 from splatpipe.shared.errors import ConfigError, MessageError
-from splatpipe.shared.messages import VisibilityBits
+from splatpipe.shared.messages import VisibilityBits, decode_render_points, encode
 
 EXAMPLES = settings(max_examples=200, derandomize=True, deadline=None)
 THRESHOLDS = st.sampled_from([0.0, 0.7, 3.0, 16.0, 200.0, 1e9])
@@ -234,3 +235,112 @@ def test_messages_do_not_share_memory_with_later_frames(small):
     kept = first.entries.copy()
     node.process(camera, VisibilityBits.pack(4, np.zeros(len(octree), np.uint8)))
     np.testing.assert_array_equal(first.entries, kept)
+
+
+# --- pooled forms --------------------------------------------------------------------------------------------------
+
+
+@st.composite
+def pooled_scenes(draw):
+    """A scene some of whose cells have a pooled form; a camera; bytes of a point, among which forms may be worth it."""
+    cloud, camera = draw(scenes())
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    octree = with_areas(cloud.octree) if draw(st.booleans()) else cloud.octree
+    has = octree.is_leaf if octree.point_order == "depth-first" else octree.n_points > 0
+    has = has & (rng.random(len(octree)) < draw(st.sampled_from([0.3, 0.9, 1.0])))
+    share = draw(st.sampled_from([0.05, 0.3, 1.0]))
+    points = np.where(has, np.maximum(1, (share * rng.random(len(octree)) * octree.n_points).astype(int)), 0)
+    pooled = replace(
+        octree,
+        pool_points=points.astype(np.uint32),
+        pool_bytes=(points * rng.integers(1, 4, len(octree))).astype(np.uint32),
+        pool_bits=draw(st.sampled_from([3, 7, 8])),
+    )
+    return pooled, camera, draw(st.sampled_from([300, 3000]))
+
+
+def pooled_of_cut(octree, camera, cut, pools, point_bytes):
+    """The cells of a cut that are drawn from their pooled form, plainly."""
+    chosen = set()
+    for cell, n in cut.items():
+        points, n_bytes = int(octree.pool_points[cell]), int(octree.pool_bytes[cell])
+        small = projected_pixels(octree, camera, cell) <= (2**octree.pool_bits) ** 2 / 2
+        n_range = len(points_of(octree, cell, n))
+        if pools == "bytes":
+            less = n_bytes + points + PALETTE_BYTES < point_bytes * n_range
+        else:
+            less = POOLED_POINT_COST * points < n_range
+        if points and small and less:
+            chosen.add(cell)
+    return chosen
+
+
+def pooled_named(octree, entries):
+    """The cells whose pooled points entries name, one by one, from the numbering as the message states it."""
+    cells = sorted(np.flatnonzero(octree.pool_points), key=lambda cell: octree.first_point[cell])
+    number = np.repeat(cells, octree.pool_points[cells])
+    named = [number[e["offset"] : e["offset"] + e["range"]] for e in entries if e["stride"] == 0]
+    named = np.concatenate([np.empty(0, int), *named])
+    for cell in set(named.tolist()):
+        assert (named == cell).sum() == octree.pool_points[cell], "whole cells, once"
+    return set(named.tolist())
+
+
+@EXAMPLES
+@given(pooled_scenes(), THRESHOLDS, st.sampled_from(["bytes", "time"]))
+def test_a_cell_of_the_cut_is_drawn_in_exactly_one_form(scene, threshold, pools):
+    octree, camera, point_bytes = scene
+    bits = CullingNode(octree, backface=False).process(camera)
+    settings_ = {"pixel_threshold": threshold, "points_per_pixel": DENSITY}
+    node = SamplingNode(octree, **settings_, pools=pools, point_bytes=point_bytes)
+    entries = node.process(camera, bits).entries
+    ranged, pooled = entries[entries["stride"] > 0], entries[entries["stride"] == 0]
+    assert (np.diff(entries["stride"] == 0) >= 0).all(), "ranges first"
+
+    cut = cut_twin(octree, camera, bits.unpack(), threshold)
+    drawn_pooled = pooled_named(octree, pooled)
+    assert drawn_pooled == pooled_of_cut(octree, camera, cut, pools, point_bytes)
+    expected = [points_of(octree, cell, n) for cell, n in cut.items() if cell not in drawn_pooled]
+    np.testing.assert_array_equal(expand(ranged), np.sort(np.concatenate([np.empty(0, int), *expected])))
+    for leaf in np.flatnonzero(octree.is_leaf & (bits.unpack() == 1)):
+        line = [leaf]
+        while octree.parent[line[-1]] >= 0:
+            line.append(octree.parent[line[-1]])
+        assert sum((cell in drawn_pooled) + (cell in cut.keys() - drawn_pooled) for cell in line) == 1
+
+    ends = pooled["offset"] + pooled["range"]
+    assert (ends[:-1] < pooled["offset"][1:]).all(), "adjacent cells are one entry"
+    off = SamplingNode(octree, **settings_).process(camera, bits).entries
+    assert (off["stride"] > 0).all()
+    assert not drawn_pooled or PooledForms.of(octree).read_bytes(off, point_bytes) > 0
+
+
+@EXAMPLES
+@given(pooled_scenes(), THRESHOLDS)
+def test_a_message_with_pooled_points_comes_back_and_is_counted(scene, threshold):
+    octree, camera, point_bytes = scene
+    bits = CullingNode(octree, backface=False).process(camera)
+    node = SamplingNode(octree, pixel_threshold=threshold, pools="bytes", point_bytes=point_bytes)
+    message = node.process(camera, bits)
+    back = decode_render_points(message.frame, bytes(encode(message)[1]))
+    np.testing.assert_array_equal(back.entries, message.entries)
+    cells = list(pooled_named(octree, message.entries))
+    assert back.n_pooled == octree.pool_points[cells].sum()
+    assert back.n_points == back.n_pooled + len(expand(message.entries[message.entries["stride"] > 0]))
+
+    forms = PooledForms.of(octree)
+    assert set(forms.cell[forms.drawn(message.entries)].tolist()) == set(cells)
+    plain = SamplingNode(octree, pixel_threshold=threshold).process(camera, bits)
+    assert forms.read_bytes(message.entries, point_bytes) <= plain.n_points * point_bytes, (
+        "never more bytes than without"
+    )
+    stand_in = expand(forms.as_ranges(octree, message.entries))
+    assert len(stand_in) == message.n_points
+    for cell in cells:
+        first = octree.first_point[cell]
+        assert ((stand_in >= first) & (stand_in < first + octree.n_points[cell])).sum() == octree.pool_points[cell]
+
+
+def test_pools_need_an_octree_that_has_them(small):
+    with pytest.raises(ConfigError, match=r"sampling.pools = 'bytes': the octree was loaded without pooled forms"):
+        SamplingNode(small[0], pixel_threshold=1.0, pools="bytes")
