@@ -76,6 +76,8 @@ def count_workload(job: Job) -> Workload:
     octree = job.load_octree()
     forms = PooledForms.of(octree)
     culling, sampling = job.culling_node(octree), job.sampling_node(octree)
+    by_distance = job.point_size.world or job.point_size.adaptive
+    columns = job.scene.positions() if by_distance else None  # held, so that coded ones are decoded once
     spacing = _Spacing(job, octree) if job.point_size.adaptive else None
     counts = FrameCounts()
     points, cold, covered, sizes = np.zeros((4, job.n_frames))
@@ -87,7 +89,7 @@ def count_workload(job: Job) -> Workload:
         cold[frame] = np.minimum(points_of(chosen.entries), COLD_POINTS).sum()
         points[frame] = chosen.n_points + (POOLED_POINT_COST - 1) * chosen.n_pooled
         covered[frame] = points[frame] * _pixels_per_point(
-            job, spacing, camera, forms.as_ranges(octree, chosen.entries)
+            job, columns, spacing, camera, forms.as_ranges(octree, chosen.entries)
         )
         head, payload = encode(chosen)
         sizes[frame] = len(head) + len(payload)
@@ -123,13 +125,19 @@ class _Spacing:
         return self._spacing[np.searchsorted(self._first, index, side="right") - 1]
 
 
-def _pixels_per_point(job: Job, spacing: _Spacing | None, camera: Camera, entries: np.ndarray) -> float:
+def _pixels_per_point(
+    job: Job,
+    columns: tuple[np.ndarray, np.ndarray, np.ndarray] | None,
+    spacing: _Spacing | None,
+    camera: Camera,
+    entries: np.ndarray,
+) -> float:
     """Mean square of the points' sides, pixels²; from an even sample of them where sides depend on distance."""
     size = job.point_size
-    if not (size.world or spacing) or not len(entries):
+    if columns is None or not len(entries):
         return float(size.pixels**2)
     index = _sample(entries)
-    x, y, z = (np.asarray(column[index], np.float64) for column in job.scene.positions())
+    x, y, z = (np.asarray(column[index], np.float64) for column in columns)
     first, origin = job.scene.blocks()
     world = origin[np.searchsorted(first, index, side="right") - 1] + np.column_stack([x, y, z])
     depth = (world - camera.eye) @ camera.pixel_from_world[2, :3]

@@ -22,6 +22,7 @@ module                  source
 ``occupancy``           octree occupancy, entropy coded (not in the papers)
 ``mixing``              adaptive probabilities from several contexts, Mahoney 2005
 ``range_coder``         yes or no at as many bits as its probability says
+``positions``           which of these a scene may store its positions with
 ``linear_groups``       Dinerstein, Egbert, Flann, "Linear Grouping": bytes, and maps of end points. Lossy
 ``group_search`` …      the same, 3: which points define lines for which; and in plain form
 ======================  ==================================================================================
