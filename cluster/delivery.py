@@ -74,9 +74,12 @@ class ReceivedArrays:
         self._rank = rank
         self._held: dict[str, np.ndarray] = {}
         self._n_requests = 0
+        self._released = False
 
     def load(self, name: str, mmap: bool) -> np.ndarray:
         """The array: read-only and shared, or a copy."""
+        if self._released:
+            raise RuntimeError(f"array {name} was loaded after the scene was released")  # nobody would answer
         if name not in self._held:
             promised = self._info.arrays[name]
             data = self._fetch(list(self._info.arrays).index(name), promised.bytes)
@@ -92,6 +95,7 @@ class ReceivedArrays:
         """Tell the other rank that no request will follow."""
         self._transport.send(self._rank, SceneRequest(self._n_requests, 0, 0, 0))
         self._held.clear()
+        self._released = True
 
     def _fetch(self, array: int, n_bytes: int) -> np.ndarray:
         """(n_bytes,) uint8 of an array, in pieces, some of them asked for ahead."""

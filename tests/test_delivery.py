@@ -116,6 +116,8 @@ def test_a_received_scene_is_the_scene(scene):
         asked = asked_for(link, scene)
         assert sorted(asked) == sorted(scene.info.arrays), "each array crosses once, however often it is loaded"
         received.release()
+        with pytest.raises(RuntimeError, match="array x was loaded after"):
+            received.positions()
 
 
 def test_long_arrays_cross_in_pieces(scene, monkeypatch):
