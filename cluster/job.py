@@ -12,7 +12,7 @@ from ..nodes.culling import CullingNode
 from ..nodes.picture.compose import Composer, Picture, PictureSettings
 from ..nodes.point_filter import PointFilter
 from ..nodes.raster import MAX_SIDE_PX, PointSize, Rasterizer, ResidentPoints, SplatSettings
-from ..nodes.raster.choose import DRAW_POOLS, check_style, draws_pools, make_rasterizer, resolve_rasterizer
+from ..nodes.raster.choose import check_style, make_rasterizer, resolve_rasterizer
 from ..nodes.raster.cpu import kernels_cached
 from ..nodes.render import RenderNode, Wanted, load_points
 from ..nodes.sampling import Pools, SamplingNode
@@ -108,8 +108,6 @@ class Job:
             return "render.positions is coded: its rasterizer draws no pools"
         if self.splats:
             return "splats are drawn, and pooled points have no radii"
-        if not draws_pools(config.render.rasterizer):
-            return f"rasterizer {resolve_rasterizer(config.render.rasterizer)} draws none, {', '.join(DRAW_POOLS)} does"
         return ""
 
     @property

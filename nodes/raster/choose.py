@@ -11,8 +11,6 @@ if TYPE_CHECKING:
     from .group_raster import ResidentGroups
 
 RASTERIZERS = ("auto", "cpu", "gl", "gl-points")
-DRAW_POOLS = ("cpu",)
-"""Those that draw pooled points."""
 
 
 def make_rasterizer(
@@ -74,11 +72,6 @@ def check_style(name: str, splats: SplatSettings | None, *, groups: bool = False
         raise ConfigError(f"render.positions = 'coded': found render.rasterizer = {name!r}, expected auto or cpu")
     if name == "gl-points" and splats:
         raise ConfigError("render.rasterizer = 'gl-points' draws no splats, expected auto, cpu or gl")
-
-
-def draws_pools(name: str) -> bool:
-    """Whether the rasterizer of points of this name draws pooled ones."""
-    return resolve_rasterizer(name) in DRAW_POOLS
 
 
 def resolve_rasterizer(name: str) -> str:

@@ -7,6 +7,7 @@ cuts runs into pieces by itself, so a frame of a billion points sends no more th
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,10 +17,13 @@ from ...shared.errors import DeviceError
 from ...shared.messages import FRAMEBUFFER_EMPTY
 from . import PointSize, ResidentPoints, pixel_from_blocks, world_sides
 from .gl_context import shader_source
-from .gl_resident import Batch, GlResident
+from .gl_resident import Batch, GlResident, Resident
+from .pieces import split_forms
 
 if TYPE_CHECKING:
     import moderngl
+
+    from .gl_pools import PoolUnits
 
 _PIECE_POINTS = 4096
 """Most points of a piece. Fewer cost time on llvmpipe, whose threads fetch workgroups one by one; more leave a GPU
@@ -33,10 +37,18 @@ _ATOMIC_INT64 = ("GL_ARB_gpu_shader_int64", "GL_NV_shader_atomic_int64")
 _PIECES, _FRAMEBUFFER, _COMMANDS, _SIDES = 8, 9, 10, 11  # bindings, as in the shaders
 
 
-class _GlPointRasterizer(GlResident):
-    """Points as squares: sizes, and the pieces of a frame.
+@dataclass(frozen=True)
+class _Pools:
+    """Pooled cells: where their units are, and what lies on the device. A piece is a unit."""
 
-    points : 16 bytes a point of device memory.
+    units: PoolUnits
+    resident: Resident
+
+
+class _GlPointRasterizer(GlResident):
+    """Points as squares: sizes, and the pieces of a frame. Pools are drawn if the points have them.
+
+    points : 16 bytes a point of device memory; of pools about their own size, and 8 more for each vertex.
     Arguments and errors otherwise as of ``GlResident``; InputError also for adaptive sizes without spacings.
     """
 
@@ -51,20 +63,61 @@ class _GlPointRasterizer(GlResident):
         self._unit_points, self._batch_units = _PIECE_POINTS, _BATCH_PIECES
         self._size = size
         self._world = world_sides(points, size)
+        self._pool_cells = points.pools
         super().__init__(points, (points.x, points.y, points.z, points.colour), width, height, device_index)
+
+    @property
+    def resident_bytes(self) -> int:
+        """Device memory that points and pools take."""
+        return super().resident_bytes + (self._pools.resident.n_bytes if self._pools else 0)
 
     def _prepare_pieces(self, *defines: str) -> None:
         self._pieces = self._buffer(bytes=16 * self._batch_units, what="pieces")
-        self._cut = self._context.compute_shader(shader_source("runs", "cut.comp", defines=defines))
-        self._cut["piece_points"] = self._unit_points
+        self._cuts = {self._points: self._cut_program(self._unit_points, "runs", "cut.comp", defines=defines)}
+        self._pools, cells = None, self._pool_cells
+        if cells is not None:
+            from .gl_pools import PoolUnits
+            from .pools import sized
+
+            units, self._pool_cells = PoolUnits(sized(cells, self._size), self._limit), None
+            self._pools = _Pools(units, self._hold(units.chunks(cells), 1, "matrices"))
+            cut = self._cut_program(1, "runs", "pools", "cut.comp", defines=("POOLS", *defines))
+            self._cuts[self._pools.resident] = cut
         if self._size.adaptive:
-            self._sides = self._buffer(bytes=4 * len(self._world), what="point sizes")
+            self._sides = {resident: self._buffer(bytes=4, what="point sizes") for resident in self._cuts}
+
+    def _cut_program(self, piece_points: int, *names: str, defines: tuple[str, ...]) -> moderngl.ComputeShader:
+        program = self._context.compute_shader(shader_source(*names, defines=defines))
+        program["piece_points"] = piece_points
+        return program
+
+    def _files(self, between: str, points: str, pools: str) -> dict[Resident, tuple[str, ...]]:
+        """Shader files of what is resident: what draws points, and what draws pools."""
+        files: dict[Resident, tuple[str, ...]] = {
+            self._points: ("rows", "columns", "squares", "points", between, points)
+        }
+        if self._pools:
+            files[self._pools.resident] = "rows", "squares", "pools", between, pools
+        return files
+
+    def _send(self, camera: Camera, entries: np.ndarray) -> list[Batch]:
+        if not self._pools:
+            return super()._send(camera, entries)
+        units, resident = self._pools.units, self._pools.resident
+        ranges, cells = split_forms(entries, units.first_point)
+        cells = np.unique(cells)
+        batches = super()._send(camera, ranges)
+        self._send_sides(resident, camera, units.world_sides(cells))
+        return batches + self._send_runs(resident, *units.runs(cells), units.rows(camera, cells))
 
     def _block_rows(self, camera: Camera, blocks: np.ndarray) -> np.ndarray:
-        if self._size.adaptive:
-            self._sides.write((self._world[blocks] * camera.focal_px).astype(np.float32))
-            self._sides.bind_to_storage_buffer(_SIDES)
+        self._send_sides(self._points, camera, self._world[blocks])
         return pixel_from_blocks(camera, self._block_origin[blocks])
+
+    def _send_sides(self, resident: Resident, camera: Camera, world: np.ndarray) -> None:
+        if self._size.adaptive:
+            sides = (world * camera.focal_px).astype(np.float32)
+            self._sides[resident] = self._write(self._sides[resident], sides, "point sizes")
 
     @property
     def _defines(self) -> tuple[str, ...]:
@@ -82,9 +135,11 @@ class _GlPointRasterizer(GlResident):
 
     def _cut_runs(self, batch: Batch) -> None:
         """Make the pieces of a batch on the device, and bind what drawing them needs."""
-        self._bind(batch.chunk)
+        self._bind(batch)
+        if self._size.adaptive:
+            self._sides[batch.resident].bind_to_storage_buffer(_SIDES)
         self._pieces.bind_to_storage_buffer(_PIECES)
-        self._dispatch(self._cut, batch)
+        self._dispatch(self._cuts[batch.resident], batch)
         self._context.memory_barrier()
 
 
@@ -120,9 +175,14 @@ class GlComputeRasterizer(_GlPointRasterizer):
         extensions, passes = (), ("PASS_DEPTH", "PASS_COLOUR")
         if not self._two_passes and context.extensions.issuperset(_ATOMIC_INT64):
             extensions, passes = _ATOMIC_INT64, ("PASS_WORD",)
-        names = "columns", "points", "scatter.comp"
+        names = self._files("framebuffer", "scatter.comp", "pools.comp")
         self._programs = [
-            context.compute_shader(shader_source(*names, extensions=extensions, defines=(*self._defines, one)))
+            {
+                resident: context.compute_shader(
+                    shader_source(*files, extensions=extensions, defines=(*self._defines, one))
+                )
+                for resident, files in names.items()
+            }
             for one in passes
         ]
         self._image = np.full(self._shape, FRAMEBUFFER_EMPTY)
@@ -131,9 +191,11 @@ class GlComputeRasterizer(_GlPointRasterizer):
 
     def _draw(self, camera: Camera, entries: np.ndarray, batches: list[Batch]) -> np.ndarray:
         self._context.copy_buffer(self._words, self._empty)
-        for program in self._programs:
-            self._set_camera(program, camera)
+        for programs in self._programs:
+            for program in programs.values():
+                self._set_camera(program, camera)
             for batch in batches:
+                program = programs[batch.resident]
                 self._cut_runs(batch)
                 self._words.bind_to_storage_buffer(_FRAMEBUFFER)
                 program["n_pieces"] = batch.n_units
@@ -164,11 +226,16 @@ class GlPointsRasterizer(_GlPointRasterizer):
         most = context.info["GL_POINT_SIZE_RANGE"][1]
         if side > most:
             raise DeviceError(f"{self.device}: found point size {side} px, expected at most {most:.0f}")
-        self._program = context.program(
-            vertex_shader=shader_source("columns", "points", "points.vert", defines=self._defines),
-            fragment_shader=shader_source("points.frag"),
-        )
-        self._vertices = context.vertex_array(self._program, [(self._pieces, "4u4/i", "piece")], mode=moderngl.POINTS)
+        self._programs = {
+            resident: context.program(
+                vertex_shader=shader_source(*files, defines=self._defines), fragment_shader=shader_source("points.frag")
+            )
+            for resident, files in self._files("squares.vert", "points.vert", "pools.vert").items()
+        }
+        self._vertices = {
+            resident: context.vertex_array(program, [(self._pieces, "4u4/r", "piece")], mode=moderngl.POINTS)
+            for resident, program in self._programs.items()
+        }
         self._image = np.empty(self._shape, np.uint64)
         self._empty = np.full(self._shape, FRAMEBUFFER_EMPTY)
         self._words = context.texture(size, 2, dtype="u4")
@@ -181,10 +248,11 @@ class GlPointsRasterizer(_GlPointRasterizer):
         self._words.write(self._empty)
         self._depth_only.clear(depth=1.0)
         self._framebuffer.use()
-        self._set_camera(self._program, camera)
+        for program in self._programs.values():
+            self._set_camera(program, camera)
         for batch in batches:
             self._commands.bind_to_storage_buffer(_COMMANDS)
             self._cut_runs(batch)
-            self._vertices.render_indirect(self._commands, count=batch.n_units)
+            self._vertices[batch.resident].render_indirect(self._commands, count=batch.n_units)
         self._words.read_into(self._image)
         return self._image

@@ -7,7 +7,7 @@ render-points draws of one block within one chunk; runs and block matrices are a
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Self
 
@@ -34,10 +34,29 @@ RUN = np.dtype([("first", "<u4"), ("count", "<u4"), ("stride", "<u4"), ("block",
 _MOST_POINTS = (1 << 32) - 1  # of a run
 
 
+@dataclass(eq=False)
+class Resident:
+    """What lies on the device in chunks, and what a frame sends of it.
+
+    chunks : buffers, in the order of their bindings.  runs : (n_runs,) RUN.  rows : the matrices that runs name.
+    """
+
+    chunks: list[list[moderngl.Buffer]]
+    runs: moderngl.Buffer
+    rows: moderngl.Buffer
+    n_runs: int = 0
+
+    @property
+    def n_bytes(self) -> int:
+        """Device memory of the chunks."""
+        return sum(buffer.size for chunk in self.chunks for buffer in chunk)
+
+
 @dataclass(frozen=True)
 class Batch:
     """What one dispatch or draw works on: units of work of a frame's runs, all in one chunk."""
 
+    resident: Resident
     chunk: int
     first_unit: int
     n_units: int
@@ -105,7 +124,7 @@ class GlResident(ABC):
     @property
     def resident_bytes(self) -> int:
         """Device memory that the point-array takes."""
-        return sum(column.size for chunk in self._chunks for column in chunk)
+        return self._points.n_bytes
 
     def draw(self, camera: Camera, entries: np.ndarray) -> np.ndarray:
         """(height, width) uint64 framebuffer words, row 0 on top; valid until the next call.
@@ -116,11 +135,8 @@ class GlResident(ABC):
         """
         height, width = self._shape
         check_viewport(camera, width, height)
-        runs, blocks, batches = self._frame_runs(entries)
         with self._context:  # another rasterizer of this thread may have made its own current
-            self._runs, self._n_runs = self._write(self._runs, runs, "runs"), len(runs)
-            self._rows.write(self._block_rows(camera, blocks))
-            image = self._draw(camera, entries, batches)
+            image = self._draw(camera, entries, self._send(camera, entries))
             check_errors(self._context, "drawing")
         return image
 
@@ -143,20 +159,24 @@ class GlResident(ABC):
         self._segment_first = np.unique(first[first < max(self._n_points, 1)])
         self._segment_chunk = np.searchsorted(self._chunk_first, self._segment_first, side="right") - 1
         self._segment_block = np.searchsorted(block_first, self._segment_first, side="right") - 1
-        self._chunks = [
-            [self._buffer(_whole_words(column[first : first + per_chunk])) for column in columns]
-            for first in self._chunk_first
-            if self._n_points
-        ]
-        self._rows = self._buffer(bytes=48 * len(self._block_origin), what="block matrices")
-        self._runs = self._buffer(bytes=RUN.itemsize << 6, what="runs")
+        chunks = (
+            [column[first : first + per_chunk] for column in columns] for first in self._chunk_first if self._n_points
+        )
+        self._points = self._hold(chunks, len(self._block_origin), "block matrices")
+
+    def _hold(self, chunks: Iterable[Sequence[np.ndarray]], n_rows: int, what: str) -> Resident:
+        """Arrays of each chunk copied to the device, and room for runs and ``n_rows`` matrices."""
+        buffers = [[self._buffer(_whole_words(array)) for array in arrays] for arrays in chunks]
+        runs = self._buffer(bytes=RUN.itemsize << 6, what="runs")
+        return Resident(buffers, runs, self._buffer(bytes=48 * n_rows, what=what))
 
     def _buffer(self, data: np.ndarray | None = None, *, bytes: int = 0, what: str = "points") -> moderngl.Buffer:
+        bytes = bytes if data is None else data.nbytes
         if bytes > self._limit:
             raise DeviceError(
                 f"{self.device}: found {bytes} bytes of {what}, expected at most {self._limit} (storage-block limit)"
             )
-        buffer = self._context.buffer(data, reserve=bytes)
+        buffer = self._context.buffer(data, reserve=0 if data is not None else bytes)
         check_errors(self._context, f"allocating {buffer.size} bytes for {what}")
         return buffer
 
@@ -169,13 +189,13 @@ class GlResident(ABC):
         buffer.write(data)
         return buffer
 
-    def _frame_runs(self, entries: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[Batch]]:
-        """(r,) RUN ordered by chunk, (k,) int64 indices of the blocks whose matrices the frame needs, batches.
+    def _send(self, camera: Camera, entries: np.ndarray) -> list[Batch]:
+        """Send runs and matrices of a frame; its batches.
 
         Cost: O(entries and the borders they cross), no more for more points.
         """
         parts = split_entries(entries, self._segment_first, self._n_points, _MOST_POINTS)
-        if len(self._chunks) > 1:
+        if len(self._points.chunks) > 1:
             parts = parts[np.argsort(self._segment_chunk[parts["segment"]], kind="stable")]
         segment = parts["segment"]
         chunk, block = self._segment_chunk[segment], self._segment_block[segment]
@@ -185,30 +205,40 @@ class GlResident(ABC):
         runs["first"] = parts["first"] - self._chunk_first[chunk]
         runs["count"], runs["stride"] = parts["count"], parts["stride"]
         runs["block"] = (np.cumsum(drawn) - 1)[block] | self._marks(segment)
-        end = np.cumsum(-(-parts["count"].astype(np.int64) // self._unit_points))
-        runs["first_unit"][:1], runs["first_unit"][1:] = 0, end[:-1]
+        n_units = -(-parts["count"].astype(np.int64) // self._unit_points)
+        return self._send_runs(self._points, runs, n_units, chunk, self._block_rows(camera, np.flatnonzero(drawn)))
 
-        last = np.append(0, end)[np.searchsorted(chunk, np.arange(len(self._chunks)), side="right")]
-        batches = [
-            Batch(i, unit, min(stop - unit, self._batch_units))
+    def _send_runs(
+        self, resident: Resident, runs: np.ndarray, n_units: np.ndarray, chunk: np.ndarray, rows: np.ndarray
+    ) -> list[Batch]:
+        """Send (r,) RUN, whose ``first_unit`` is filled here, and (k, 3, 4) float32 matrices; the frame's batches.
+
+        n_units, chunk : (r,) int64, units of work of each run, and its chunk, ascending.
+        """
+        end = np.cumsum(n_units)
+        runs["first_unit"] = end - n_units
+        resident.runs, resident.n_runs = self._write(resident.runs, runs, "runs"), len(runs)
+        resident.rows = self._write(resident.rows, rows, "matrices")
+        last = np.append(0, end)[np.searchsorted(chunk, np.arange(len(resident.chunks)), side="right")]
+        return [
+            Batch(resident, i, unit, min(stop - unit, self._batch_units))
             for i, (begin, stop) in enumerate(zip([0, *last[:-1].tolist()], last.tolist(), strict=False))
             for unit in range(begin, stop, self._batch_units)
         ]
-        return runs, np.flatnonzero(drawn), batches
 
     def _marks(self, segment: np.ndarray) -> np.ndarray | int:
         """Bits above the place of a run's block, for (r,) segments."""
         return 0
 
-    def _bind(self, chunk: int) -> None:
-        for binding, buffer in enumerate(self._chunks[chunk]):
+    def _bind(self, batch: Batch) -> None:
+        for binding, buffer in enumerate(batch.resident.chunks[batch.chunk]):
             buffer.bind_to_storage_buffer(binding)
-        self._rows.bind_to_storage_buffer(ROWS)
-        self._runs.bind_to_storage_buffer(RUNS)
+        batch.resident.rows.bind_to_storage_buffer(ROWS)
+        batch.resident.runs.bind_to_storage_buffer(RUNS)
 
     def _dispatch(self, program: moderngl.ComputeShader, batch: Batch) -> None:
         """Run a program that includes ``runs.glsl``, one invocation a unit of the batch."""
-        program["n_runs"] = self._n_runs
+        program["n_runs"] = batch.resident.n_runs
         program["first_unit"], program["n_units"] = batch.first_unit, batch.n_units
         program.run(*self._folded(-(-batch.n_units // GROUP_SIZE)))
 
@@ -219,10 +249,10 @@ class GlResident(ABC):
 
 
 def _whole_words(column: np.ndarray) -> np.ndarray:
-    """A column as 32-bit words; the last bytes of a shorter type are padded."""
+    """A column as 32-bit words, one at least; the last bytes of a shorter type are padded."""
     column = np.ascontiguousarray(column)
-    if column.itemsize == 4:
+    if column.itemsize == 4 and column.size:
         return column
-    words = np.zeros(-(-column.nbytes // 4), np.uint32)
-    words.view(column.dtype)[: len(column)] = column
+    words = np.zeros(max(-(-column.nbytes // 4), 1), np.uint32)
+    words.view(np.uint8)[: column.nbytes] = column.view(np.uint8).ravel()
     return words

@@ -76,7 +76,7 @@ class GlSplatRasterizer(GlResident):
         context, size = self._context, (self._shape[1], self._shape[0])
         self._batch_units = min(self._batch_units, self._limit // _SPLAT_BYTES)
         self._splats = self._buffer(bytes=_SPLAT_BYTES * self._batch_units, what="splats")
-        self._maker = context.compute_shader(shader_source("runs", "splats", "columns", "splats.comp"))
+        self._maker = context.compute_shader(shader_source("runs", "splats", "rows", "columns", "splats.comp"))
         self._visibility, self._colour = (
             context.program(
                 vertex_shader=shader_source("splats", "splats.vert", defines=(one,)),
@@ -197,7 +197,7 @@ class GlSplatRasterizer(GlResident):
         self._maker["focal_px"] = camera.focal_px
 
     def _make_splats(self, batch: Batch) -> None:
-        self._bind(batch.chunk)
+        self._bind(batch)
         self._splats.bind_to_storage_buffer(_SPLATS)
         self._dispatch(self._maker, batch)
         self._context.memory_barrier()
