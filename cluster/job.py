@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..nodes.culling import CullingNode
+from ..nodes.layer_sampling import LayerSamplingNode
 from ..nodes.picture.compose import Composer, Picture, PictureSettings
 from ..nodes.point_filter import PointFilter
 from ..nodes.raster import MAX_SIDE_PX, PointSize, Rasterizer, ResidentPoints, SplatSettings
 from ..nodes.raster.choose import check_style, make_rasterizer, resolve_rasterizer
 from ..nodes.raster.cpu import kernels_cached
-from ..nodes.render import RenderNode, Wanted, load_points
+from ..nodes.raster.gl_context import require_gl
+from ..nodes.render import RenderNode, Wanted, load_drawn, load_points
 from ..nodes.sampling import Pools, SamplingNode
 from ..shared.camera import Camera
 from ..shared.colour import Colouring, parse_colour
 from ..shared.config import RunConfig
 from ..shared.errors import ConfigError
+from ..shared.layers.layer_store import open_layer
 from ..shared.messages import RenderPoints
 from ..shared.octree import Octree
 from ..shared.store import Scene
@@ -27,6 +30,7 @@ from ..shared.views import camera_views
 from .sink import FrameSink, layer_name
 
 if TYPE_CHECKING:
+    from ..nodes.layer_render import LayerRenderNode
     from ..nodes.raster.group_raster import ResidentGroups
 
 SPLAT_COLOUR = "#d0d0d0"
@@ -79,6 +83,9 @@ class Job:
         check_style(render.rasterizer, self.splats, groups=self.coded)
         if self.coded and self.point_filter:
             raise ConfigError("render.positions = 'coded': found a filter, which takes points out of their groups")
+        self.layers = [open_layer(layer.path) for layer in config.layers]
+        if self.layers:
+            require_gl("layers are drawn with OpenGL")
         self.background = parse_colour(render.background, "render.background")
         self.colouring = Colouring.choose(
             self.scene, render.colour, render.colormap, render.colour_range, render.class_colours
@@ -111,8 +118,17 @@ class Job:
         return ""
 
     @property
-    def position_bytes(self) -> int:
-        """Bytes of a position as it is read; compact ones as where cells are small on the screen, at least."""
+    def rasterizer(self) -> str:
+        """Name of the rasterizer that draws, ``auto`` resolved."""
+        return "cpu" if self.coded else resolve_rasterizer(self.config.render.rasterizer)
+
+    @property
+    def position_bytes(self) -> float:
+        """Bytes of a position as it is read; compact ones as where cells are small on the screen, at least; coded ones
+        as they are stored.
+        """
+        if self.coded:
+            return self.scene.info.position_bytes / self.scene.info.n_stored
         return 4 if self.compact else 12
 
     @property
@@ -149,17 +165,23 @@ class Job:
             point_bytes=self.position_bytes + self.colour_bytes,
         )
 
+    def layer_nodes(self) -> list[tuple[CullingNode, LayerSamplingNode]]:
+        """The culling and the sampling node of each layer of this run."""
+        return [
+            (
+                CullingNode(layer.octree, backface=False, margin_px=1.0),
+                LayerSamplingNode(layer.octree, detail_px=settings.detail_px),
+            )
+            for layer, settings in zip(self.layers, self.config.layers, strict=True)
+        ]
+
     def load_points(self, *, verify: bool) -> ResidentPoints:
         """The points of this run, with what it needs of them; coded ones are decoded. Raises StoreError."""
         return load_points(self.scene, self.colouring, self.wanted, verify=verify)
 
     def load_drawn(self, *, verify: bool) -> ResidentPoints | ResidentGroups:
         """The points of this run in the form it draws them from. Raises StoreError."""
-        if not self.coded:
-            return self.load_points(verify=verify)
-        from ..nodes.grouped_cells import load_groups
-
-        return load_groups(self.scene, self.colouring, self.wanted, verify=verify)
+        return load_drawn(self.scene, self.colouring, self.wanted, verify=verify)
 
     def make_rasterizer(self, points: ResidentPoints | ResidentGroups) -> Rasterizer:
         """The rasterizer of this run over ``points``; the caller closes it. Raises DeviceError."""
@@ -185,15 +207,28 @@ class Job:
             rasterizer = stack.enter_context(self.make_rasterizer(points))
             self.scene.release()
             node = RenderNode(rasterizer)
-            if rasterizer.name == "cpu" and not kernels_cached(self.wanted.pools):
+            if rasterizer.name == "cpu" and not kernels_cached(pools=self.wanted.pools, groups=self.coded):
                 progress("compiling kernels (once; kept for the next run)", 0)
             node.warm_up(self.camera(0))
+            layers = None
+            if self.layers:
+                progress("loading layers", 0)
+                layers = stack.enter_context(self._open_layers())
+                layers.warm_up(self.camera(0))
             composer = sink = None
             if output.png or output.mp4 or output.depth or output.normals:
                 composer = stack.enter_context(Composer(self.picture_settings))
                 composer.warm_up([self.camera(view) for view in range(self.views.per_picture)])
                 sink = stack.enter_context(FrameSink(self.output, png=output.png, mp4=output.mp4, fps=output.fps))
-            yield RenderStage(node, composer, sink, self.views.per_picture)
+            yield RenderStage(node, layers, composer, sink, self.views.per_picture)
+
+    @contextmanager
+    def _open_layers(self) -> Iterator[LayerRenderNode]:
+        from ..nodes.layer_render import LayerRenderNode
+        from ..nodes.layers.gl_canvas import GlLayers
+
+        with GlLayers(self.layers, self.config.layers, self.views.width, self.views.height) as canvas:
+            yield LayerRenderNode(canvas)
 
     @property
     def picture_settings(self) -> PictureSettings:
@@ -249,16 +284,26 @@ class Job:
 class RenderStage:
     """Render node, composition and output of one run."""
 
-    def __init__(self, node: RenderNode, composer: Composer | None, sink: FrameSink | None, per_picture: int) -> None:
+    def __init__(
+        self,
+        node: RenderNode,
+        layers: LayerRenderNode | None,
+        composer: Composer | None,
+        sink: FrameSink | None,
+        per_picture: int,
+    ) -> None:
         self._node = node
+        self._layers = layers
         self._composer = composer
         self._sink = sink
         self._per_picture = per_picture
-        self.description = node.description
+        self.description = " + ".join(part.description for part in (node, layers) if part)
 
-    def draw(self, camera: Camera, chosen: RenderPoints) -> Picture | None:
+    def draw(self, camera: Camera, chosen: RenderPoints, of_layers: Sequence[RenderPoints] = ()) -> Picture | None:
         """Draw a frame; the picture that it completes, None before its last view or where nobody wants it."""
         words = self._node.process(camera, chosen)
+        if self._layers is not None:
+            words = self._layers.process(camera, of_layers, words)
         if self._composer is None:
             return None
         return self._composer.add(camera.frame % self._per_picture, camera, words)

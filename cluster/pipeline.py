@@ -40,6 +40,7 @@ def run_single(job: Job, progress: Progress) -> dict[str, Any]:
     counts = FrameCounts()
     octree = job.load_octree()
     culling, sampling = job.culling_node(octree), job.sampling_node(octree)
+    layers = job.layer_nodes()
     sampling.process(job.camera(0), culling.process(job.camera(0)))  # compiles, or loads what was compiled
     with job.open_render(progress) as render:
         started = time.perf_counter()
@@ -48,10 +49,12 @@ def run_single(job: Job, progress: Progress) -> dict[str, Any]:
             camera = job.camera(frame)
             with clocks[CULLING].working():
                 bits = culling.process(camera)
+                bits_of_layers = [layer_culling.process(camera) for layer_culling, _ in layers]
             with clocks[SAMPLING].working():
                 chosen = sampling.process(camera, bits)
+                of_layers = [node.process(camera, seen) for (_, node), seen in zip(layers, bits_of_layers, strict=True)]
             with clocks[RENDER].working():
-                picture = render.draw(camera, chosen)
+                picture = render.draw(camera, chosen, of_layers)
             with clocks[RENDER].waiting():
                 render.show(frame, picture)
             counts.add(bits, chosen)
@@ -94,6 +97,7 @@ def _coordinate(job: Job, transport: Transport, progress: Progress) -> dict[str,
     clock = StageClock("culling")
     culling = job.culling_node(job.scene.octree())
     culling.process(job.camera(0))
+    layers = [layer_culling for layer_culling, _ in job.layer_nodes()]
     progress("loading the scene", 0)
     transport.meet()
     counts = FrameCounts()
@@ -117,7 +121,9 @@ def _coordinate(job: Job, transport: Transport, progress: Progress) -> dict[str,
             transport.send(rank, camera)
         with clock.working():
             bits = culling.process(camera)
-        transport.send(SAMPLING, bits)
+            bits_of_layers = [layer_culling.process(camera) for layer_culling in layers]
+        for message in (bits, *bits_of_layers):
+            transport.send(SAMPLING, message)
         counts.add(bits)
     while len(latency_s) < job.n_frames:
         frame_done()
@@ -152,14 +158,19 @@ def _sample(job: Job, transport: Transport) -> None:
     sampling = job.sampling_node(octree)
     sampling.process(job.camera(0), job.culling_node(octree).process(job.camera(0)))
     transport.meet()
-    bits_bytes = (len(octree) + 7) // 8
+    layers = [node for _, node in job.layer_nodes()]
+    n_cells = [len(octree), *(len(layer.octree) for layer in job.layers)]
     for _ in range(job.n_frames):
         with clock.waiting():
             camera = decode_camera(*transport.receive(CULLING, Kind.CAMERA, _MAX_CAMERA_BYTES))
-            bits = decode_visibility(*transport.receive(CULLING, Kind.VISIBILITY, bits_bytes), len(octree))
+            bits, *bits_of_layers = [
+                decode_visibility(*transport.receive(CULLING, Kind.VISIBILITY, (n + 7) // 8), n) for n in n_cells
+            ]
         with clock.working():
-            chosen = sampling.process(camera, bits)
-        transport.send(RENDER, chosen)
+            chosen = [sampling.process(camera, bits)]
+            chosen += [node.process(camera, seen) for node, seen in zip(layers, bits_of_layers, strict=True)]
+        for message in chosen:
+            transport.send(RENDER, message)
     transport.send_note(CULLING, Kind.STATISTICS, job.n_frames, _statistics(transport, clock, FrameCounts()))
 
 
@@ -167,15 +178,19 @@ def _render(job: Job, transport: Transport) -> None:
     clock = StageClock("render")
     counts = FrameCounts()
     info = job.scene.info
-    chosen_bytes = (info.n_cells + info.n_stored // 2**31 + 1) * RENDER_POINT.itemsize  # a longer range is split
+    most_entries = [info.n_cells + info.n_stored // 2**31 + 1]  # a longer range is split
+    most_entries += [len(layer.octree) for layer in job.layers]
     with job.open_render(lambda *_: None) as render:
         transport.meet()
         for frame in range(job.n_frames):
             with clock.waiting():
                 camera = decode_camera(*transport.receive(CULLING, Kind.CAMERA, _MAX_CAMERA_BYTES))
-                chosen = decode_render_points(*transport.receive(SAMPLING, Kind.RENDER_POINTS, chosen_bytes))
+                chosen, *of_layers = [
+                    decode_render_points(*transport.receive(SAMPLING, Kind.RENDER_POINTS, n * RENDER_POINT.itemsize))
+                    for n in most_entries
+                ]
             with clock.working():
-                picture = render.draw(camera, chosen)
+                picture = render.draw(camera, chosen, of_layers)
             with clock.waiting():
                 render.show(frame, picture)
             counts.add(chosen)
