@@ -78,7 +78,7 @@ def pool_positions(
 
 def _encode(points: np.ndarray, bits: int, n_pools: int) -> tuple[np.ndarray, int] | None:
     """The code of distinct grid points and their number; None where it does not pay."""
-    data = streams.encode(points, bits, n_pools).data
+    data = streams.encode(points, bits, n_pools, least_gain=streams.LEAST_GAIN).data
     return (data, len(points)) if streams.keeps_pools(streams.read_pools(data, bits, len(points))) else None
 
 

@@ -17,6 +17,7 @@ Source: Kim, Lee, Varshney, "Vertex Transformation Streams", section 5, equation
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -47,6 +48,14 @@ def common_translations(points: np.ndarray, size: int = PALETTE_SIZE) -> tuple[n
     shorter along its longest axis, then by x, y, z.
     Cost: O(N log N) time and 16 bytes for each of the N values of the padded grid (32 in float64); n > 0.
     """
+    *_, (translations, counts, _) = translation_rounds(points, size)
+    return translations, counts
+
+
+def translation_rounds(points: np.ndarray, size: int = PALETTE_SIZE) -> Iterator[tuple[np.ndarray, np.ndarray, bool]]:
+    """As ``common_translations``, for each reach in turn: the most common translations among those that are no longer,
+    and whether the counts prove that there are no others; that round is the last.
+    """
     lower = points.min(axis=0).astype(np.int64)
     extent = points.max(axis=0) - lower + 1
     least = max(1, int(np.ceil(len(points) * LEAST_SHARE)))
@@ -58,8 +67,10 @@ def common_translations(points: np.ndarray, size: int = PALETTE_SIZE) -> tuple[n
         inside = np.rint(counts[window]).astype(np.int64)
         counts[window] = 0
         translations, found = _most_common(inside, reach, least, size)
-        if (reach == longest).all() or np.rint(counts.max()) < (found[-1] + 1 if len(found) == size else least):
-            return translations, found
+        proven = (reach == longest).all() or np.rint(counts.max()) < (found[-1] + 1 if len(found) == size else least)
+        yield translations, found, bool(proven)
+        if proven:
+            return
         reach = np.minimum(longest, 2 * reach)
 
 

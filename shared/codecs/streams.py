@@ -49,6 +49,10 @@ POINT_BYTES = 3
 LEAST_GAIN = 4 / 3
 """Pools are worth having where the points without them would need this many times the bytes."""
 
+PROMISE = 0.85
+"""Share of a gain that short translations must show, for longer ones to be looked for. On the cells of the scans, those
+made the gain at most 1.09 times as large."""
+
 
 @dataclass(frozen=True)
 class PooledPoints:
@@ -76,11 +80,18 @@ def keeps_pools(pooled: PooledPoints, least_gain: float = LEAST_GAIN) -> bool:
     return bool(pooled.pools) and POINT_BYTES * len(pooled) >= least_gain * pooled.n_bytes
 
 
-def encode(points: np.ndarray, bits: int = DEFAULT_BITS, n_pools: int = 2, width: int | None = None) -> Encoded:
+def encode(
+    points: np.ndarray,
+    bits: int = DEFAULT_BITS,
+    n_pools: int = 2,
+    width: int | None = None,
+    least_gain: float = 0.0,
+) -> Encoded:
     """(n, 3) integers in [0, 2**bits), duplicates allowed. Raises CodecError for anything else.
 
     n_pools : most pools; those that save no bytes are left out.  width : translations that a tag has room for, a
-    multiple of 32 up to 256; None: what saves most.
+    multiple of 32 up to 256; None: what saves most.  least_gain : where short translations promise less than this, the
+    search is given up and no pool made, which takes half the time or less.
     """
     points = check_points(points, bits)
     _check_bits(bits)
@@ -92,7 +103,7 @@ def encode(points: np.ndarray, bits: int = DEFAULT_BITS, n_pools: int = 2, width
     first, counts = distinct(keys[order])
     if not len(points):
         return Encoded(write_head(counts), order)
-    pools, which = find_pools(points[order[first]], n_pools, width)
+    pools, which = find_pools(points[order[first]], n_pools, width, least_gain)
     data = [write_head(counts[which]), write_varints(np.array([len(pools)]))]
     data += [write_varints(np.array([len(pool.vertices), len(pool.translations)])) for pool in pools]
     for pool in pools:
@@ -106,15 +117,20 @@ def encode(points: np.ndarray, bits: int = DEFAULT_BITS, n_pools: int = 2, width
     return Encoded(np.concatenate(data), gather_runs(order, first, counts, which))
 
 
-def find_pools(points: np.ndarray, n_pools: int, width: int | None) -> tuple[list[Pool], np.ndarray]:
+def find_pools(points: np.ndarray, n_pools: int, width: int | None, least_gain: float) -> tuple[list[Pool], np.ndarray]:
     """Pools of (n, 3) distinct grid points, n > 0, and (n,) int64: the points in coded order."""
-    from .autocorrelation import common_translations
+    from .autocorrelation import translation_rounds
 
-    if n_pools <= 0:
-        return [], np.arange(len(points))
-    translations, _ = common_translations(points)
-    pools, covered, loose = greedy_pools(points, translations, n_pools, width)
-    return pools, np.concatenate([covered, loose])
+    for translations, _, proven in translation_rounds(points) if n_pools > 0 else ():
+        if not (proven or least_gain):
+            continue
+        pools, covered, loose = greedy_pools(points, translations, n_pools, width)
+        if proven:
+            return pools, np.concatenate([covered, loose])
+        n_bytes = POINT_BYTES * len(points) - sum(pool.saved_bytes for pool in pools)
+        if POINT_BYTES * len(points) < PROMISE * least_gain * n_bytes:
+            break
+    return [], np.arange(len(points))
 
 
 def decode(data: np.ndarray, bits: int, most_points: int) -> np.ndarray:
