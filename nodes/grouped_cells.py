@@ -53,6 +53,9 @@ def load_groups(scene: Scene, colouring: Colouring, wanted: Wanted, *, verify: b
             except CodecError as error:
                 raise StoreError(f"{scene.path}/position_codes.npy: {error}") from error
     cells = group_cells([cell for cell in held if cell is not None])
+    if colour.strides == (0,):  # one colour, and one word of it
+        kept, inner = (np.broadcast_to(colour[:1], len(column)) for column in (cells.kept_colour, cells.inner_colour))
+        cells = cells._replace(kept_colour=kept, inner_colour=inner)
     return ResidentGroups(cells, coded.cells.first_point, None if heads is None else _spacing(octree, coded, heads))
 
 

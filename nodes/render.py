@@ -6,6 +6,7 @@ Frames need no cell of the octree; what goes by cell is made when points are loa
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,6 +19,9 @@ from .cell_blocks import cell_blocks, cell_features, cell_spacing
 from .point_filter import PointFilter, features_left
 from .pooled_entries import PooledForms
 from .raster import Rasterizer, ResidentPoints
+
+if TYPE_CHECKING:
+    from .raster.group_raster import ResidentGroups
 
 
 class RenderNode:
@@ -73,6 +77,15 @@ class Wanted:
             raise StoreError(f"{scene.path}: positions are {scene.info.positions}: build it with --positions groups")
         if self.pools and not scene.info.pool_bits:
             raise StoreError(f"{scene.path}: no pooled cells: build it with --pools")
+
+
+def load_drawn(scene: Scene, colouring: Colouring, wanted: Wanted, *, verify: bool) -> ResidentPoints | ResidentGroups:
+    """The render rank's half of a scene in the form that it is drawn from: ``load_points``, or linear groups."""
+    if not wanted.groups:
+        return load_points(scene, colouring, wanted, verify=verify)
+    from .grouped_cells import load_groups
+
+    return load_groups(scene, colouring, wanted, verify=verify)
 
 
 def load_points(scene: Scene, colouring: Colouring, wanted: Wanted = Wanted(), *, verify: bool) -> ResidentPoints:

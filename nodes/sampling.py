@@ -65,7 +65,7 @@ class SamplingNode:
         points_per_pixel: float = 2.0,
         whole_sets: bool = False,
         pools: Pools = "off",
-        point_bytes: int = POINT_BYTES,
+        point_bytes: float = POINT_BYTES,
     ):
         if not (pixel_threshold >= 0 and math.isfinite(pixel_threshold)):
             raise ConfigError(f"sampling.pixel_threshold = {pixel_threshold}, expected a number ≥ 0")

@@ -15,8 +15,8 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from ...shared.config import PositiveInt, RunConfig, read_toml, validated
-from ...shared.section import Section
 from ...shared.errors import ConfigError
+from ...shared.section import Section
 
 SWEPT_SECTIONS = ("sampling", "render", "culling", "positions", "image")
 REFERENCE_KEYS = ("render.colour", "render.colormap", "render.colour_range", "render.background")
@@ -156,6 +156,8 @@ def _changed(config: PointConfig, values: dict[str, Any], source: str) -> PointC
         if (found := getattr(getattr(changed, section), key)) != expected:
             why = "errors are measured on frames as they are drawn"
             raise ConfigError(f"{source}: {section}.{key} = {found!r}: {why}, expected {expected!r}")
+    if changed.render.positions == "coded" and (bits := changed.positions.bits_per_axis):
+        raise ConfigError(f"{source}: positions.bits_per_axis = {bits}: found render.positions = 'coded', expected 0")
     return changed
 
 

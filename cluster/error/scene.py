@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from ...nodes.culling import CullingNode
 from ...nodes.pooled_entries import PooledForms
 from ...nodes.raster import ResidentPoints
 from ...nodes.raster.fixed_point import fixed_point
-from ...nodes.render import RenderNode, Wanted, load_points
+from ...nodes.render import RenderNode, Wanted, load_drawn, load_points
 from ...nodes.sampling import SamplingNode
 from ...shared.camera import Camera
 from ...shared.messages import RenderPoints, VisibilityBits
@@ -26,6 +27,9 @@ from ..job import Job
 from ..progress import FrameProgress
 from .config import ErrorConfig, SceneEntry, SweepPoint, base_config, sweep_points
 from .reference import References
+
+if TYPE_CHECKING:
+    from ...nodes.raster.group_raster import ResidentGroups
 
 STAGES = ("culling", "sampling", "render")
 
@@ -73,7 +77,7 @@ class _Loaded:
     scene: Scene
     octree: Octree
     forms: PooledForms
-    points: ResidentPoints
+    points: ResidentPoints | ResidentGroups
 
 
 class SweptScene:
@@ -111,7 +115,7 @@ class SweptScene:
                 scenes[order] = rebuild_in_order(own, order, path, progress.show)
             scene = scenes[order]
             octree = scene.octree(features=wanted.features, pools=wanted.pools)
-            points = load_points(scene, self._colouring, wanted, verify=self._job.config.scene.verify)
+            points = load_drawn(scene, self._colouring, wanted, verify=self._job.config.scene.verify)
             self._loaded[order, wanted] = _Loaded(scene, octree, PooledForms.of(octree), points)
 
     @contextmanager
@@ -120,15 +124,18 @@ class SweptScene:
         job = Job(point.config)
         loaded = self._loaded[self.order_of(point), job.wanted]
         points, bits = loaded.points, point.config.positions.bits_per_axis
-        if bits:
-            points = fixed_point(points, loaded.scene.info.edge, bits)
+        position_bytes = job.position_bytes
+        if not isinstance(points, ResidentPoints):
+            position_bytes = points.cells.position_bytes / len(points)
+        elif bits:
+            points, position_bytes = fixed_point(points, loaded.scene.info.edge, bits), 3 * bits / 8
         with job.make_rasterizer(points) as rasterizer:
             yield Pipeline(
                 job.culling_node(loaded.octree),
                 job.sampling_node(loaded.octree),
                 RenderNode(rasterizer),
                 loaded.forms,
-                3 * bits / 8 if bits else job.position_bytes,
+                position_bytes,
                 job.colour_bytes,
             )
 
@@ -136,7 +143,10 @@ class SweptScene:
         """(height, width) uint64 words of the reference frame of each camera."""
         loaded = self._loaded[self._job.scene.info.point_order, self._job.wanted]
         look = self._colouring, self._job.point_size, self._job.point_filter
-        kept = References(self._folder / "references", loaded.scene, loaded.points, *look)
+        points = loaded.points
+        if not isinstance(points, ResidentPoints):
+            points = load_points(loaded.scene, self._colouring, self._job.wanted, verify=False)
+        kept = References(self._folder / "references", loaded.scene, points, *look)
         return [
             kept.frame(camera, lambda done, i=i: progress.show(f"{self.name}: reference {i + 1}", done, self.n_points))
             for i, camera in enumerate(self.cameras)

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from ...nodes.picture.compose import Composer, Picture
 from ...nodes.point_filter import ClipBox, PointFilter
 from ...nodes.raster import PointSize, Rasterizer, ResidentPoints
 from ...nodes.raster.choose import make_rasterizer
-from ...nodes.render import load_points
+from ...nodes.render import load_drawn
 from ...nodes.sampling import SamplingNode
 from ...shared.camera import Camera
 from ..job import Job
@@ -43,6 +43,9 @@ from .part import (
     PNG,
     SPLAT_LOOP,
 )
+
+if TYPE_CHECKING:
+    from ...nodes.raster.group_raster import ResidentGroups
 
 _ONE_PIXEL_BY_SIZE = PointSize(1, world=1e-30, maximum=1)
 """One pixel, but only the kernel with sizes finds that out."""
@@ -169,14 +172,14 @@ class _Bench:
         self._entries: dict[int, np.ndarray] = {}
 
     @cached_property
-    def points(self) -> ResidentPoints:
+    def points(self) -> ResidentPoints | ResidentGroups:
         """The points of the run."""
-        return self.job.load_points(verify=False)
+        return self.job.load_drawn(verify=False)
 
-    def load(self, **wanted: Any) -> ResidentPoints:
+    def load(self, **wanted: Any) -> ResidentPoints | ResidentGroups:
         """The points of the run with more wanted of them."""
         job = self.job
-        return load_points(job.scene, job.colouring, replace(job.wanted, **wanted), verify=False)
+        return load_drawn(job.scene, job.colouring, replace(job.wanted, **wanted), verify=False)
 
     def entries(self, camera: Camera) -> np.ndarray:
         """What the run draws of a frame; the second time nothing is computed."""
@@ -184,7 +187,7 @@ class _Bench:
             self._entries[camera.frame] = self.sampling.process(camera, self.culling.process(camera)).entries
         return self._entries[camera.frame]
 
-    def rasterizer(self, points: ResidentPoints, size: PointSize) -> Rasterizer:
+    def rasterizer(self, points: ResidentPoints | ResidentGroups, size: PointSize) -> Rasterizer:
         """The rasterizer of the run over these points."""
         job, render = self.job, self.job.config.render
         width, height, threads = job.views.width, job.views.height, render.threads or None
@@ -228,7 +231,12 @@ def _level_of_detail(bench: _Bench) -> Trial | None:
     if bench.job.pixel_threshold > 0:
         return None
     culling, plain = bench.culling, bench.sampling
-    levelled = SamplingNode(bench.octree, pixel_threshold=_NEVER_BELOW_PX, points_per_pixel=_MORE_THAN_ANY)
+    levelled = SamplingNode(
+        bench.octree,
+        pixel_threshold=_NEVER_BELOW_PX,
+        points_per_pixel=_MORE_THAN_ANY,
+        whole_sets=plain.whole_sets,
+    )
     return Trial(
         LEVEL_OF_DETAIL,
         lambda camera: plain.process(camera, culling.process(camera)).entries,
@@ -252,38 +260,42 @@ def _adaptive_size(bench: _Bench) -> Trial | None:
 
 def _class_filter(bench: _Bench) -> Trial | None:
     """Put back by a filter that keeps every class, of a scene that has them."""
-    if bench.job.point_filter.classes or "classification" not in bench.job.scene.info.attributes:
+    if bench.job.coded or bench.job.point_filter.classes or "classification" not in bench.job.scene.info.attributes:
         return None
     return _loading(bench, CLASSES, _ALL_CLASSES)
 
 
 def _clip_boxes(bench: _Bench) -> Trial | None:
     """Put back by a box that holds everything."""
-    return None if bench.job.point_filter.boxes else _loading(bench, BOXES, _WHOLE_WORLD)
+    return None if bench.job.coded or bench.job.point_filter.boxes else _loading(bench, BOXES, _WHOLE_WORLD)
 
 
 def _loading(bench: _Bench, part: str, keeps_all: PointFilter) -> Trial:
     given = bench.job.point_filter
     both = PointFilter(given.classes or keeps_all.classes, given.boxes or keeps_all.boxes)
-    return Trial(
-        part,
-        lambda _: bench.load().x.view(np.uint32),  # bits, so that what is filtered out equals itself
-        lambda _: bench.load(point_filter=both).x.view(np.uint32),
-        once=True,
-    )
+    return Trial(part, lambda _: _bits(bench.load()), lambda _: _bits(bench.load(point_filter=both)), once=True)
+
+
+def _bits(points: ResidentPoints | ResidentGroups) -> np.ndarray:
+    """A column of positions, as bits, so that what is filtered out equals itself."""
+    return points.x.view(np.uint32) if isinstance(points, ResidentPoints) else points.cells.x
 
 
 def _colour_column(bench: _Bench) -> Trial | None:
     if bench.job.colouring.mode != "constant":
         return None
-    column = np.ascontiguousarray(bench.points.colour)
-    with_column = bench.rasterizer(replace(bench.points, colour=column), bench.job.point_size)
-    return Trial(COLOUR, bench.draw, bench.drawing(with_column))
+    points = bench.points
+    if isinstance(points, ResidentPoints):
+        points = replace(points, colour=np.ascontiguousarray(points.colour))
+    else:
+        kept, inner = map(np.ascontiguousarray, (points.cells.kept_colour, points.cells.inner_colour))
+        points = replace(points, cells=points.cells._replace(kept_colour=kept, inner_colour=inner))
+    return Trial(COLOUR, bench.draw, bench.drawing(bench.rasterizer(points, bench.job.point_size)))
 
 
 def _checksums(bench: _Bench) -> Trial | None:
     def load(verify: bool) -> np.ndarray:
-        return bench.job.load_points(verify=verify).x.view(np.uint32)
+        return _bits(bench.job.load_drawn(verify=verify))
 
     return Trial(CHECKSUMS, lambda _: load(False), lambda _: load(True), once=True)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ...nodes.raster.choose import resolve_rasterizer
 from ..job import Job
 from .workload import Workload
 
@@ -63,7 +62,7 @@ COSTS = UnitCosts()
 
 def draw_core_s(job: Job, work: Workload, costs: UnitCosts = COSTS) -> float:
     """Seconds of one core that drawing an average frame takes; 0 where OpenGL draws."""
-    if resolve_rasterizer(job.config.render.rasterizer) != "cpu":
+    if job.rasterizer != "cpu":
         return 0.0
     if job.splats:
         point_s = costs.splat_s

@@ -6,8 +6,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
-from ...nodes.raster.choose import resolve_rasterizer
 from ...shared.messages import FRAMEBUFFER_EMPTY, RENDER_POINT
+from ...shared.pooled import PoolCounts
 from ..job import Job
 from .costs import COSTS
 from .part import (
@@ -53,7 +53,7 @@ def parts(job: Job, work: Workload, decision: Decision) -> list[Part]:
         _quads(job, work),
         _colour(job),
         *_attributes(job),
-        _codec(),
+        _codec(job),
         _flatness(job),
         _checksums(job),
         _opengl(job),
@@ -175,29 +175,26 @@ def _adaptive_size(job: Job, work: Workload) -> Part:
 
 def _compact_positions(job: Job) -> Part:
     cost_s = COSTS.compact_s * job.scene.info.n_stored
-    rasterizer = resolve_rasterizer(job.config.render.rasterizer)
-    if job.compact and (job.splats or rasterizer != "cpu"):
-        why = f"{'splats' if job.splats else f'rasterizer {rasterizer}'}: only points on cpu are drawn from them"
+    if job.compact and (job.splats or job.rasterizer != "cpu"):
+        why = f"{'splats' if job.splats else f'rasterizer {job.rasterizer}'}: only points on cpu are drawn from them"
         return Part("compact positions", True, why, cost_s, "s of loading")
     if job.compact:
         why = "render.positions is compact: 4 or 8 bytes a point are read for its 12"
         return Part("compact positions", False, why, cost_s, "s of loading")
-    return Part(
-        "compact positions", True, "render.positions is float32: drawn as they are stored", cost_s, "s of loading"
-    )
+    why = "render.positions is " + ("coded" if job.coded else "float32")
+    return Part("compact positions", True, why, cost_s, "s of loading")
 
 
 def _pools(job: Job, work: Workload) -> Part:
-    size_mb = 1e-6 * job.scene.info.pool_bytes or None
+    scene = job.scene
+    size_mb = 1e-6 * scene.info.pool_bytes or None
+    held = "the scene was built without --pools"
+    if scene.info.pool_bits:
+        held = ", ".join(PoolCounts.of(scene.octree(pools=True)).texts())
     if job.pools == "off":
-        return Part("pools", True, job.why_no_pools, size_mb, "MB read", "counted")
+        return Part("pools", True, f"{job.why_no_pools}; {held}", size_mb, "MB read", "counted")
     share = work.pooled_points / max(work.points, 1)
-    why = f"sampling.pools is {job.pools}: {share:.0%} of the points are drawn from them"
-    if work.owners:
-        why += (
-            f"; {work.pooled_cells:.0f} of {work.owners:.0f} cells have them, in the others they are not a quarter"
-            " smaller than points of three bytes"
-        )
+    why = f"sampling.pools is {job.pools}: {share:.0%} of the points are drawn from them; {held}"
     return Part("pools", False, why, size_mb, "MB read", "counted")
 
 
@@ -232,8 +229,15 @@ def _attributes(job: Job) -> list[Part]:
     return [Part(f"attributes {', '.join(unused)}", True, why, size_mb, "MB read", "counted")]
 
 
-def _codec() -> Part:
-    return Part("codecs", True, "the scene holds plain float32 positions", None, "ms/frame")
+def _codec(job: Job) -> Part:
+    info = job.scene.info
+    if info.positions == "float32":
+        return Part("codecs", True, "the scene holds plain float32 positions", None, "s of loading")
+    bits = 8 * info.position_bytes / info.n_stored
+    why = f"the scene holds positions as {info.positions}, {bits:.1f} bits each, which are decoded when they are loaded"
+    if job.coded:
+        why = f"render.positions is coded: whole sets are drawn from linear groups, {bits:.1f} bits a position"
+    return Part("codecs", False, why, None, "s of loading")
 
 
 def _flatness(job: Job) -> Part:
@@ -246,16 +250,16 @@ def _flatness(job: Job) -> Part:
 
 def _checksums(job: Job) -> Part:
     info = job.scene.info
-    cost_s = COSTS.checksum_s * (12 * info.n_stored + sum(info.arrays[f"attr_{n}"].bytes for n in job.attributes_read))
+    read = (*info.position_arrays, *(f"attr_{name}" for name in job.attributes_read))
+    cost_s = COSTS.checksum_s * sum(info.arrays[name].bytes for name in read)
     if job.config.scene.verify:
         return Part(CHECKSUMS, False, "scene.verify is true: damage is named, not drawn", cost_s, "s of loading")
     return Part(CHECKSUMS, True, "scene.verify is false", cost_s, "s of loading")
 
 
 def _opengl(job: Job) -> Part:
-    rasterizer = resolve_rasterizer(job.config.render.rasterizer)
-    cpu = rasterizer == "cpu"
-    why = "rasterizer cpu: no import, context or shader" if cpu else f"rasterizer {rasterizer}"
+    cpu = job.rasterizer == "cpu"
+    why = "rasterizer cpu: no import, context or shader" if cpu else f"rasterizer {job.rasterizer}"
     return Part(OPENGL, cpu, why, COSTS.opengl_s, "s of starting")
 
 

@@ -13,7 +13,6 @@ import os
 from dataclasses import asdict, dataclass
 from typing import Literal
 
-from ...nodes.raster.choose import resolve_rasterizer
 from ...shared.messages import RENDER_POINT
 from ..job import Job
 from ..launch import mpi_available
@@ -70,7 +69,7 @@ def estimate(job: Job, work: Workload, cores: int, costs: UnitCosts = COSTS) -> 
     alone_s = costs.entry_s * work.entries + costs.picture_s * work.pixels * shown  # on one core, others wait
     threads = min(job.config.render.threads or cores, cores)
     render_core_s = draw_core_s(job, work, costs) + compose_core_s(job, work, costs) * shown
-    gpu_s = 0.0 if resolve_rasterizer(job.config.render.rasterizer) == "cpu" else costs.gl_point_s * work.points
+    gpu_s = 0.0 if job.rasterizer == "cpu" else costs.gl_point_s * work.points
     render_s = render_core_s / threads + gpu_s + alone_s
     encode_s = (costs.png_s * output.png + costs.mp4_s * output.mp4) * composed
     busy_s = work.culling_s + work.sampling_s + render_core_s + alone_s + encode_s

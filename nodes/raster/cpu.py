@@ -91,10 +91,10 @@ class CpuRasterizer(FramebufferRasterizer):
         return self._draw_frame(camera, n_points, *work)
 
 
-def kernels_cached(pools: bool = False) -> bool:
+def kernels_cached(*, pools: bool = False, groups: bool = False) -> bool:
     """Whether the first frame will load the kernels instead of compiling them (some seconds).
 
-    pools : whether pools are drawn, too.
+    pools : whether pools are drawn, too.  groups : whether linear groups are drawn instead.
     True if the compiled files are younger than the source, as far as numba's cache folder tells.
     """
     from . import pieces
@@ -104,6 +104,10 @@ def kernels_cached(pools: bool = False) -> bool:
         index = folder.glob(f"{source.stem}.{kernel.py_func.__qualname__}-*.nbi")
         return any(file.stat().st_mtime > source.stat().st_mtime for file in index)
 
+    if groups:
+        from .groups import draw_groups
+
+        return cached(draw_groups) and cached(kernels.merge)
     needed = [kernels.draw, kernels.merge, pieces._split]
     if pools:
         from .pools import draw_pools

@@ -57,6 +57,7 @@ class GroupCells(NamedTuple):
     x, y, z : (k,) uint16, grid points of the kept points.  kept_colour : (k,) uint32 colour words.
     v1, v2 : (g,) uint16, among the kept points of the run.  n_inner : (g,) uint16.
     parameter : (m,) uint8, in 1/256.  inner_colour : (m,) uint32 colour words.
+    One colour may be held as one word that is repeated with stride 0; kernels are compiled for that apart.
     """
 
     origin: np.ndarray
