@@ -35,4 +35,18 @@ def gl_layer(context: moderngl.Context, layer: Layer, settings: LayerSection) ->
 
             mesh = strips(layer)
             return GlMesh(context, layer, settings, separate(mesh) if technique == "triangles" else mesh)
+        case "polygons", "avc":
+            from .gl_polygons import GlPolygons
+
+            return GlPolygons(context, layer, settings)
+        case "polygons", "instancing":
+            from .gl_polygons import GlPolygonInstances
+
+            return GlPolygonInstances(context, layer, settings)
+        case "polygons", "triangles" | "strips":
+            from . import expand_polygons
+            from .gl_mesh import GlMesh
+
+            expand = expand_polygons.triangles if technique == "triangles" else expand_polygons.strips
+            return GlMesh(context, layer, settings, expand(layer))
     raise ConfigError(f"layer {layer.name}: technique {technique!r} of {layer.kind}: not found")
