@@ -50,11 +50,10 @@ class PoolCounts(NamedTuple):
 
     def texts(self) -> list[str]:
         """The counts, for people."""
-        gain = 1 - 1 / streams.LEAST_GAIN
         return [
-            f"{self.pooled:,} of {sum(self):,} cells with points",
-            f"{self.too_few:,} have fewer than {LEAST_POINTS} points",
-            f"{self.no_gain:,} would save less than {gain:.0%} of three bytes a point",
+            f"{self.pooled:,} of {sum(self):,} cells with points have a pooled form",
+            f"too few points (below {LEAST_POINTS}): {self.too_few:,}",
+            f"saving less than {1 - 1 / streams.LEAST_GAIN:.0%} of three bytes a point: {self.no_gain:,}",
         ]
 
 

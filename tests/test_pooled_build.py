@@ -258,9 +258,9 @@ def test_info_says_which_cells_have_pools_and_why_the_others_have_none(scene, tm
     octree = scene.octree(pools=True)
     pooled, few = octree.pool_points > 0, octree.n_points < LEAST_POINTS
     assert told == [
-        f"{pooled.sum()} of {len(octree)} cells with points",
-        f"{few.sum()} have fewer than 256 points",
-        f"{(~pooled & ~few).sum()} would save less than 25% of three bytes a point",
+        f"{pooled.sum()} of {len(octree)} cells with points have a pooled form",
+        f"too few points (below 256): {few.sum()}",
+        f"saving less than 25% of three bytes a point: {(~pooled & ~few).sum()}",
     ]
 
 

@@ -9,7 +9,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from ...nodes.pooled_entries import PooledForms
 from ..job import Job
 from ..record import FrameCounts
 
@@ -24,8 +23,7 @@ class Workload:
     """Counts and seconds of an average frame.
 
     cells : of the octree.  cells_visible, entries, points : what culling lets through, what sampling asks for.
-    pooled_points : of those, from pools.  owners, pooled_cells : cells that own points, and those of them that have a
-    pooled form; counted in a look.
+    pooled_points : of those, from pools.
     pixels : drawn.  culling_s, sampling_s : measured on this machine.
     render_s : measured where a run has drawn, else None.
     """
@@ -39,8 +37,6 @@ class Workload:
     sampling_s: float
     render_s: float | None = None
     pooled_points: float = 0.0
-    owners: float = 0.0
-    pooled_cells: float = 0.0
 
     @classmethod
     def of_look(cls, job: Job) -> Workload:
@@ -65,8 +61,6 @@ class Workload:
             pixels=_pixels(job),
             culling_s=culling_s,
             sampling_s=sampling_s,
-            owners=len(octree.owners),
-            pooled_cells=len(PooledForms.of(octree)),
             **mean,
         )
 
