@@ -132,9 +132,9 @@ class Job:
         return 4 if self.compact else 12
 
     @property
-    def colour_bytes(self) -> int:
-        """Bytes of a point's colour."""
-        return 0 if self.colouring.mode == "constant" else 4
+    def attribute_bytes(self) -> int:
+        """Bytes of a point's colour, and of a splat's normal and radius."""
+        return (0 if self.colouring.mode == "constant" else 4) + (5 if self.splats else 0)
 
     def load_octree(self) -> Octree:
         """The cells, with what the sampling node of this run needs of them. Raises StoreError."""
@@ -162,7 +162,7 @@ class Job:
             points_per_pixel=points_per_pixel,
             whole_sets=self.coded,
             pools=self.pools,
-            point_bytes=self.position_bytes + self.colour_bytes,
+            point_bytes=self.position_bytes + self.attribute_bytes,
         )
 
     def layer_nodes(self) -> list[tuple[CullingNode, LayerSamplingNode]]:

@@ -18,7 +18,7 @@ from ...shared.config import PositiveInt, RunConfig, read_toml, validated
 from ...shared.errors import ConfigError
 from ...shared.section import Section
 
-SWEPT_SECTIONS = ("sampling", "render", "culling", "positions", "image")
+SWEPT_SECTIONS = ("sampling", "render", "culling", "splats", "positions", "image")
 REFERENCE_KEYS = ("render.colour", "render.colormap", "render.colour_range", "render.background")
 """A sweep may change any key of those sections but these: camera, scene and colour stay what the reference shows."""
 

@@ -32,10 +32,10 @@ class Axis:
 
 
 COSTS = (
-    Axis("frame_ms", "frame time, ms (median)", ("sampling", "render", "culling")),
+    Axis("frame_ms", "frame time, ms (median)", ("sampling", "render", "culling", "splats")),
     Axis("read_bytes", "bytes of points read a frame", ("sampling", "culling", "positions")),
     Axis("message_bytes", "message bytes a frame (between ranks)", ("sampling", "culling")),
-    Axis("frame_bytes", "bytes a frame (messages + picture)", ("sampling", "render", "culling", "image")),
+    Axis("frame_bytes", "bytes a frame (messages + picture)", ("sampling", "render", "culling", "splats", "image")),
     Axis("position_bytes", "bytes a position (resident)", ("positions",)),
 )
 ERRORS = (

@@ -19,6 +19,7 @@ from ...nodes.raster.fixed_point import fixed_point
 from ...nodes.render import RenderNode, Wanted, load_drawn, load_points
 from ...nodes.sampling import SamplingNode
 from ...shared.camera import Camera
+from ...shared.errors import ConfigError
 from ...shared.messages import RenderPoints, VisibilityBits
 from ...shared.octree import Octree
 from ...shared.rebuild import rebuild_in_order
@@ -39,7 +40,7 @@ class Pipeline:
     """Culling, sampling and render node of one point, called one after the other in this process.
 
     forms : the pooled forms of its scene.  position_bytes : of a position as it is read, but from pools.
-    colour_bytes : of a point's colour.
+    attribute_bytes : of what else is read of a point.
     """
 
     culling: CullingNode
@@ -47,7 +48,7 @@ class Pipeline:
     render: RenderNode
     forms: PooledForms
     position_bytes: float
-    colour_bytes: int
+    attribute_bytes: int
 
     def draw(self, camera: Camera) -> tuple[VisibilityBits, RenderPoints, np.ndarray]:
         """The messages of a frame, and its words, which are valid until the next call."""
@@ -57,7 +58,7 @@ class Pipeline:
 
     def read_bytes(self, chosen: RenderPoints) -> float:
         """Bytes of points that drawing a frame reads."""
-        return self.forms.read_bytes(chosen.entries, self.position_bytes + self.colour_bytes)
+        return self.forms.read_bytes(chosen.entries, self.position_bytes + self.attribute_bytes)
 
     def timed_draw(self, camera: Camera) -> list[float]:
         """Seconds of each of ``STAGES`` for one frame."""
@@ -114,6 +115,11 @@ class SweptScene:
                 path = self._folder / "scenes" / f"{self.name}-{order}.scene"
                 scenes[order] = rebuild_in_order(own, order, path, progress.show)
             scene = scenes[order]
+            if wanted.groups and scene is not own:
+                raise ConfigError(
+                    f"sweep: order = {order!r}: scenes that are built in another order hold float32 positions, "
+                    "expected 'as built' for render.positions = 'coded'"
+                )
             octree = scene.octree(features=wanted.features, pools=wanted.pools)
             points = load_drawn(scene, self._colouring, wanted, verify=self._job.config.scene.verify)
             self._loaded[order, wanted] = _Loaded(scene, octree, PooledForms.of(octree), points)
@@ -136,7 +142,7 @@ class SweptScene:
                 RenderNode(rasterizer),
                 loaded.forms,
                 position_bytes,
-                job.colour_bytes,
+                job.attribute_bytes,
             )
 
     def references(self, progress: FrameProgress) -> list[np.ndarray]:
