@@ -83,6 +83,9 @@ def build(
     group_epsilon: Annotated[
         float, typer.Option(help="groups: largest error, as a share of the scene's size.")
     ] = 0.005,
+    group_detail: Annotated[
+        float, typer.Option(help="groups: error at most this share of the extent of about 128 points; 0: off.")
+    ] = 0.0,
     pools: Annotated[bool, typer.Option("--pools", help="Store dense cells as transformation streams, too.")] = False,
     pool_bits: Annotated[int, typer.Option(help="Pools: bits an axis, up to 8; 0: as suits --points-per-cell.")] = 0,
     strict: Annotated[bool, typer.Option(help="Refuse points that are not finite instead of dropping them.")] = False,
@@ -110,6 +113,7 @@ def build(
         positions=positions,
         position_bits=position_bits,
         group_epsilon=group_epsilon,
+        group_detail=group_detail,
         pools=pools,
         pool_bits=pool_bits,
         strict=strict,

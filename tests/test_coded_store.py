@@ -326,6 +326,7 @@ def test_float32_scenes_have_no_codes(scenes):
         ({"position_bits": 22}, r"position_bits = 22, expected 1 … 21 for ci"),
         ({"positions": "groups", "position_bits": 17}, r"position_bits = 17, expected 1 … 16 for groups"),
         ({"group_epsilon": float("nan")}, r"group_epsilon = nan, expected a number in \[0, 1\]"),
+        ({"group_detail": -0.1}, r"group_detail = -0.1, expected a number in \[0, 1\]"),
     ],
 )
 def test_what_a_codec_cannot_take_is_refused(changes, message):

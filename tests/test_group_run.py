@@ -15,6 +15,11 @@ from hypothesis import strategies as st
 from PIL import Image
 from splatpipe.cluster.job import Job
 from splatpipe.cluster.launch import mpi_available
+from splatpipe.cluster.plan.ablation import same, trials
+from splatpipe.cluster.plan.needs import parts
+from splatpipe.cluster.plan.part import ADAPTIVE, CHECKSUMS, COLOUR, SPLAT_LOOP, Part
+from splatpipe.cluster.plan.topology import Decision
+from splatpipe.cluster.plan.workload import Workload
 from splatpipe.nodes.culling import CullingNode
 from splatpipe.nodes.grouped_cells import load_groups
 from splatpipe.nodes.raster import PointSize, ResidentPoints
@@ -178,6 +183,24 @@ def test_sides_follow_the_spacing_of_the_decoded_points(scenes, order):
         CpuGroupRasterizer(loaded(scene), 8, 8, size)
 
 
+@each_order
+def test_epsilon_follows_local_detail(tmp_path, order):
+    """The rows of the sheet are straight over a cell and bent over the scene."""
+    off, n_bytes = [], []
+    for detail in (0.0, 0.01):
+        path = tmp_path / f"{detail}.scene"
+        chosen = BuildSettings(
+            point_order=order, points_per_cell=500, positions="groups", group_epsilon=0.05, group_detail=detail
+        )
+        build_scene([ArraySource(cloud(), columns_for(N_POINTS))], path, settings=chosen)
+        groups = loaded(Scene.open(path))
+        points = as_points(groups)
+        off.append(np.linalg.norm(world(points) - cloud()[points.colour], axis=1).max())
+        n_bytes.append(groups.cells.position_bytes)
+    assert off[1] < 0.3 * off[0]
+    assert n_bytes[0] < n_bytes[1] < 6 * N_POINTS * 2
+
+
 # --- entries and cells ------------------------------------------------------------------------------------------
 
 FIRST = np.array([0, 3, 4, 9, 15, 16])
@@ -305,6 +328,21 @@ def test_what_cannot_be_drawn_from_groups_is_refused(scenes, config, tmp_path):
     job = Job(load_config(config, ["render.rasterizer=auto"]))
     with job.make_rasterizer(job.load_drawn(verify=False)) as rasterizer:
         assert isinstance(rasterizer, CpuGroupRasterizer)
+
+
+def test_plan_says_so_and_its_ablation_changes_no_bit(config):
+    job = Job(load_config(config, ["render.colour=#ffffff"]))
+
+    def codecs(job: Job) -> Part:
+        found = parts(job, Workload.of_look(job), Decision("single", "so"))
+        return next(part for part in found if part.what == "codecs")
+
+    assert not codecs(job).left_out
+    assert codecs(job).why.startswith("render.positions is coded: whole sets are drawn from linear groups")
+    assert "decoded when they are loaded" in codecs(Job(load_config(config, ["render.positions=float32"]))).why
+    with trials(job) as found:
+        assert {trial.part for trial in found} >= {COLOUR, SPLAT_LOOP, ADAPTIVE, CHECKSUMS}
+        assert all(same(trial, job.camera(0)) for trial in found)
 
 
 def test_splats_are_refused(tmp_path, config):

@@ -95,7 +95,11 @@ class _Coder:
         self._owners, self._columns = owners, columns
         self._bits, self._point_order = settings.position_bits, settings.point_order
         self._codecs: dict[float, Codec] = {
-            edge: position_codec(settings.positions, settings.group_epsilon * extent / edge * 2.0**self._bits)
+            edge: position_codec(
+                settings.positions,
+                settings.group_epsilon * extent / edge * 2.0**self._bits,
+                settings.group_detail or None,
+            )
             for edge in np.unique(owners.edge).tolist()
         }
 

@@ -37,6 +37,7 @@ class BuildSettings:
     positions : form in which positions are stored, one of ``scene_info.POSITIONS``; codecs other than float32 round
         them to a grid of ``position_bits`` bits an axis in the cube of their cell.
     group_epsilon : ε of ``groups``, as a share of the longest side of the scene's bounds.
+    group_detail : ε is also at most this share of the extent of the points that are grouped together; 0: as it is.
     pools : store cells that gain by it in pooled form (``codecs.streams``) beside their points.
     pool_bits : bits an axis of the pooled form's grid; 0: as suits ``points_per_cell``.
     n_pools : most pools of a cell.
@@ -60,6 +61,7 @@ class BuildSettings:
     positions: str = "float32"
     position_bits: int = 12
     group_epsilon: float = 0.005
+    group_detail: float = 0.0
     pools: bool = False
     pool_bits: int = 0
     n_pools: int = 2
@@ -80,6 +82,7 @@ class BuildSettings:
             (self.positions in POSITIONS, "positions", f"one of {', '.join(POSITIONS)}"),
             (1 <= self.position_bits <= most_bits, "position_bits", f"1 … {most_bits} for {self.positions}"),
             (0 <= self.group_epsilon <= 1, "group_epsilon", "a number in [0, 1]"),
+            (0 <= self.group_detail <= 1, "group_detail", "a number in [0, 1]"),
             (0 <= self.pool_bits <= MAX_STREAM_BITS, "pool_bits", f"0 … {MAX_STREAM_BITS}"),
             (1 <= self.n_pools <= 16, "n_pools", "1 … 16"),
             (self.threads is None or self.threads >= 1, "threads", "at least 1"),

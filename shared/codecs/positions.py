@@ -14,10 +14,10 @@ def most_position_bits(name: str) -> int:
     return _MOST_GROUP_BITS if name == "groups" else MAX_BITS
 
 
-def position_codec(name: str, epsilon: float = 0.0) -> Codec:
+def position_codec(name: str, epsilon: float = 0.0, detail: float | None = None) -> Codec:
     """The codec of one of ``scene_info.POSITIONS`` but float32; imports that one only.
 
-    epsilon : of ``groups``, grid steps; decoding needs none.  Raises CodecError for another name.
+    epsilon, detail : of ``groups``, see ``LinearGroupCodec``; decoding needs none.  Raises CodecError for another name.
     """
     match name:
         case "ci":
@@ -29,7 +29,7 @@ def position_codec(name: str, epsilon: float = 0.0) -> Codec:
         case "groups":
             from .linear_groups import LinearGroupCodec
 
-            return LinearGroupCodec(epsilon)
+            return LinearGroupCodec(epsilon, detail=detail)
         case _:
             raise CodecError(f"codec of positions: found {name!r}, expected ci, eci, occupancy or groups")
     return codec
