@@ -20,6 +20,9 @@ from ..shared.readers import expand_inputs, open_source
 from ..shared.store import Scene
 from .progress import FrameProgress
 
+FLOAT32_BYTES = 12
+"""Of a position as float32."""
+
 _console = Console(highlight=False, soft_wrap=True)
 
 
@@ -47,16 +50,20 @@ def _build(sources: list[Any], output: Path, settings: BuildSettings, json: Path
     with FrameProgress(None) as progress:
         report = build_scene(sources, output, settings=settings, progress=progress.show)
     seconds = time.perf_counter() - started
-    _tell_build(output, report, seconds)
+    _tell_build(output, report, seconds, settings.positions)
     if json is not None:
         write_json(json, {"seconds": seconds, **asdict(report), "path": str(report.path)})
 
 
-def _tell_build(output: Path, report: BuildReport, seconds: float) -> None:
+def _tell_build(output: Path, report: BuildReport, seconds: float, positions: str) -> None:
     _console.print(
         f"wrote {output}: {report.n_points:,} points, {report.n_cells:,} cells, "
         f"{seconds:.1f} s, {report.n_points / seconds / 1e6:.1f} M points/s"
     )
+    if positions != "float32":
+        a_point = report.position_bytes / report.n_stored
+        advice = ": fewer --position-bits suit it" if a_point >= FLOAT32_BYTES else ""
+        _console.print(f"  positions as {positions}: {a_point:.2f} bytes a point, {FLOAT32_BYTES} as float32{advice}")
     if report.n_dropped:
         _console.print(f"  dropped {report.n_dropped:,} points with coordinates that are not finite")
     for name in report.dropped_attributes:

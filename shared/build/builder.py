@@ -107,6 +107,7 @@ class _Build:
             n_partitions=self.assembly.n_partitions,
             spilled_bytes=runs.bytes if runs else 0,
             bytes=sum(array.bytes for array in info.arrays.values()),
+            position_bytes=sum(info.arrays[name].bytes for name in info.position_arrays),
             peak_bytes=peak_resident_bytes(),
             stage_s=self.stage_s,
         )

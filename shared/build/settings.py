@@ -104,7 +104,8 @@ class BuildReport:
     dropped_attributes : in some of the inputs, but not in all of them.
     n_partitions : subtrees that were built one after the other; 1 if the input fitted into memory.
     spilled_bytes : written to sorted runs and read again; 0 if the input fitted into memory.
-    bytes : of the scene's arrays.  peak_bytes : most memory the process held so far.
+    bytes : of the scene's arrays.  position_bytes : of those that hold positions.
+    peak_bytes : most memory the process held so far.
     stage_s : seconds in each stage.
     """
 
@@ -117,6 +118,7 @@ class BuildReport:
     n_partitions: int
     spilled_bytes: int
     bytes: int
+    position_bytes: int
     peak_bytes: int
     stage_s: dict[str, float] = field(default_factory=dict)
 
