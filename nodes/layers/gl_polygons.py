@@ -55,6 +55,7 @@ class GlPolygons(GlLayer):
         records = self._send()
         content = [(records, "2f4 2f4 1u4", "position", "apex", "owner")]
         self.vertices = self._context.vertex_array(self.program, content, mode=moderngl.POINTS)
+        self.vertices.vertices = len(self._layer.elements)
         self._bind_next(0)
 
     def _send(self) -> moderngl.Buffer:
