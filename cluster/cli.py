@@ -396,6 +396,38 @@ def bench_codecs(
     raise typer.Exit(int(any(row["failed"] for row in results["rows"])))
 
 
+@bench_app.command("budget")
+def bench_budget(
+    inputs: Annotated[
+        list[str] | None, typer.Argument(help="Scenes, point files, folders or globs; default: a generated surface.")
+    ] = None,
+    bits: Annotated[int, typer.Option(help="Of the grid in a cell, an axis.", min=1, max=8)] = 6,
+    pools: Annotated[int, typer.Option(help="At most so many of a cell.", min=1, max=16)] = 2,
+    cells: Annotated[int, typer.Option(help="At most so many leaves of each scene, evenly spread.", min=1)] = 1000,
+    points_per_cell: Annotated[int, typer.Option(help="Of scenes built from point files.", min=1)] = 32768,
+    size: Annotated[int, typer.Option(help="Width and height, pixels.", min=16, max=8192)] = 1024,
+    repeats: Annotated[int, typer.Option(help="Timed frames of each way.", min=1)] = 9,
+    json: JsonOption = None,
+) -> None:
+    """Frames drawn by OpenGL from pools and from points, with as much device memory: what does not fit is sent.
+
+    Example: `splatpipe bench budget lion.ply --json budget.json`
+    """
+    from .bench.budget import bench_budget as measure
+    from .bench.budget import print_budget
+
+    results = measure(
+        inputs or [],
+        bits=bits,
+        n_pools=pools,
+        most_cells=cells,
+        points_per_cell=points_per_cell,
+        size=size,
+        repeats=repeats,
+    )
+    _report(results, print_budget, json)
+
+
 @bench_app.command("build")
 def bench_build(
     points: Annotated[int, typer.Option(help="Number of points of the LAS file.", min=1000)] = 20_000_000,

@@ -134,6 +134,12 @@ class TestOnDevice:
             for first in (0, 5, 195):
                 again = entries_of(many, [first + c for c in (4, 0, 1, 3, 2, 3)], *RANGES)
                 np.testing.assert_array_equal(split.draw(VIEW, again), expected)
+            loose = many.pools.loose.shape[1]
+            for kept in (0, loose // 3, loose):
+                sent = split.loose_sent(kept)
+                assert sent.n_bytes == 5 * (loose - kept)
+                sent.send()
+                np.testing.assert_array_equal(split.draw(VIEW, again), expected)
 
     @BOTH
     def test_what_a_frame_does_not_name_is_not_drawn(self, points, rasterizer):

@@ -16,6 +16,7 @@ from ...shared.camera import Camera
 from ...shared.errors import DeviceError
 from ...shared.messages import FRAMEBUFFER_EMPTY
 from . import PointSize, ResidentPoints, pixel_from_blocks, world_sides
+from .gl_budget import SentEachFrame
 from .gl_context import shader_source
 from .gl_resident import Batch, GlResident, Resident
 from .pieces import split_forms
@@ -70,6 +71,21 @@ class _GlPointRasterizer(GlResident):
     def resident_bytes(self) -> int:
         """Device memory that points and pools take."""
         return super().resident_bytes + (self._pools.resident.n_bytes if self._pools else 0)
+
+    def points_sent(self, n_kept: int) -> SentEachFrame:
+        """The point-array without its first ``n_kept`` points, to be sent with each frame."""
+        kept = [4 * max(n_kept - int(first), 0) for first in self._chunk_first]
+        parts = [(buffer, n) for chunk, n in zip(self._points.chunks, kept, strict=False) for buffer in chunk]
+        return SentEachFrame(self._context, parts)
+
+    def loose_sent(self, n_kept: int) -> SentEachFrame:
+        """The points of pooled cells that no pool covers, without the first ``n_kept``, to be sent with each frame."""
+        parts = []
+        if self._pools:
+            for buffers, n in zip(self._pools.resident.chunks, self._pools.units.loose_left(n_kept), strict=True):
+                _, records, _, colours, _ = buffers
+                parts += [(records, records.size - 4 * int(n)), (colours, colours.size - int(n))]
+        return SentEachFrame(self._context, parts)
 
     def _prepare_pieces(self, *defines: str) -> None:
         self._pieces = self._buffer(bytes=16 * self._batch_units, what="pieces")

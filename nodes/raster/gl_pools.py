@@ -71,6 +71,7 @@ class PoolUnits:
             ends = [np.searchsorted(*each, side="right") - 1 for each in zip(bytes_before, most, strict=True)]
             first.append(max(int(min(ends)), first[-1] + 1))
         self._chunk_first = np.array(first)
+        self._first_loose = pools.first_loose[self._chunk_first]
 
     def chunks(self, pools: PoolCells) -> Iterator[tuple[np.ndarray, ...]]:
         """(u,) UNIT; records, translations and colour indices as bytes or words; (c, 256) palettes: of each chunk.
@@ -82,6 +83,10 @@ class PoolUnits:
             records, first_record = _records(cells)
             translations = _packed(cells.translations.view(np.uint8))
             yield _units(cells, first_record), records, translations, _colours(cells), cells.palette
+
+    def loose_left(self, n_kept: int) -> np.ndarray:
+        """(chunks,) int64, loose points behind the first ``n_kept`` ones. They are the last records and colours."""
+        return np.diff(self._first_loose) - np.diff(np.minimum(self._first_loose, n_kept))
 
     def runs(self, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(k,) RUN of (k,) int64 cells, ascending; their numbers of units, their chunks. Matrices stand in their order.
