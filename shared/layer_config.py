@@ -12,6 +12,12 @@ from pydantic import Field
 from .section import Section
 
 
+class BlockStyle(Section):
+    """``[layers.blocks]``."""
+
+    texture: Literal["grain", "plain"] = "grain"
+
+
 class LayerSection(Section):
     """One of ``[[layers]]``."""
 
@@ -21,3 +27,4 @@ class LayerSection(Section):
     colormap: str = "viridis"
     value_range: tuple[float, float] | None = None
     value_filter: tuple[float, float] | None = None
+    blocks: BlockStyle = BlockStyle()

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import typer
 
+from .blocks import blocks
 from .cuboids import cuboids
 from .polygons import polygons
 
 layer_app = typer.Typer(help="Make a layer of objects to draw besides the points: buildings, tracks, treemaps.")
+layer_app.command("blocks")(blocks)
 layer_app.command("cuboids")(cuboids)
 layer_app.command("polygons")(polygons)

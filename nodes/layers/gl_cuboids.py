@@ -21,7 +21,7 @@ class GlCuboids(GlLayer):
         self.program = self._context.program(
             vertex_shader=layer_shader("gradient", "cuboids.vert"),
             geometry_shader=layer_shader("output", "emit", "cube", "cuboids.geom", defines=("FLAT",)),
-            fragment_shader=layer_shader("surface.frag", defines=("FLAT",)),
+            fragment_shader=layer_shader("word", "surface.frag", defines=("FLAT",)),
             varyings=VARYINGS,
         )
         self._gradient = Gradient(self._context, self._settings, self._layer.objects["value"])
@@ -44,7 +44,7 @@ class GlCuboidInstances(GlCuboids):
 
         self.program = self._context.program(
             vertex_shader=layer_shader("gradient", "output", "cuboids_instanced.vert", defines=("FLAT",)),
-            fragment_shader=layer_shader("surface.frag", defines=("FLAT",)),
+            fragment_shader=layer_shader("word", "surface.frag", defines=("FLAT",)),
         )
         self._gradient = Gradient(self._context, self._settings, self._layer.objects["value"])
         records = self._context.buffer(self._layer.objects)

@@ -20,6 +20,21 @@ def gl_layer(context: moderngl.Context, layer: Layer, settings: LayerSection) ->
     """The layer on the device. Raises ConfigError for a kind or technique that does not exist."""
     technique = settings.technique
     match layer.kind, technique:
+        case "blocks", "avc":
+            from .gl_blocks import GlBlocks
+
+            return GlBlocks(context, layer, settings)
+        case "blocks", "instancing":
+            from .gl_blocks import GlBlockInstances
+
+            return GlBlockInstances(context, layer, settings)
+        case "blocks", "triangles" | "strips":
+            from .expand_blocks import strips
+            from .gl_blocks import GlBlockMesh
+            from .mesh import separate
+
+            mesh = strips(layer)
+            return GlBlockMesh(context, layer, settings, separate(mesh) if technique == "triangles" else mesh)
         case "cuboids", "avc":
             from .gl_cuboids import GlCuboids
 

@@ -33,7 +33,7 @@ class GlMesh(GlLayer):
         flat = ("FLAT",) if mesh.flat else ()
         self.program = self._context.program(
             vertex_shader=layer_shader("gradient", "output", "mesh.vert", defines=flat),
-            fragment_shader=layer_shader("surface.frag", defines=flat),
+            fragment_shader=layer_shader("word", "surface.frag", defines=flat),
         )
         self._gradient = Gradient(self._context, self._settings, self._layer.objects["value"])
         vertices = np.empty(len(mesh.position), VERTEX)

@@ -49,7 +49,7 @@ class GlPolygons(GlLayer):
         self.program = self._context.program(
             vertex_shader=layer_shader("gradient", "polygon", "polygons.vert"),
             geometry_shader=layer_shader("output", "emit", "polygons.geom", defines=("FLAT",)),
-            fragment_shader=layer_shader("surface.frag", defines=("FLAT",)),
+            fragment_shader=layer_shader("word", "surface.frag", defines=("FLAT",)),
             varyings=VARYINGS,
         )
         records = self._send()
@@ -93,7 +93,7 @@ class GlPolygonInstances(GlPolygons):
 
         self.program = self._context.program(
             vertex_shader=layer_shader("gradient", "output", "polygon", "polygons_instanced.vert", defines=("FLAT",)),
-            fragment_shader=layer_shader("surface.frag", defines=("FLAT",)),
+            fragment_shader=layer_shader("word", "surface.frag", defines=("FLAT",)),
         )
         records = self._send()
         template = self._context.buffer(TEMPLATE)
