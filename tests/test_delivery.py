@@ -52,6 +52,8 @@ def scenes(tmp_path_factory):
     city = CityScan(n_points=20_000)
     build_scene([city], folder / "city", settings=BuildSettings(points_per_cell=300, splats=True, features=True))
     build_scene([city], folder / "coded", settings=BuildSettings(points_per_cell=300, positions="occupancy"))
+    build_scene([city], folder / "groups", settings=BuildSettings(points_per_cell=300, positions="groups"))
+    build_scene([city], folder / "pools", settings=BuildSettings(points_per_cell=5000, pools=True))
     return folder
 
 
@@ -173,6 +175,42 @@ def test_what_goes_by_cell_asks_for_cells(scenes, scene):
     assert len(set(asked)) == len(asked)
     local = parse_config(config.model_dump() | {"scene": {"path": str(scenes / "city")}})
     assert np.array_equal(points.block_spacing, Job(local).load_points(verify=False).block_spacing)
+
+
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [
+        ("coded", {}),
+        ("coded", {"render": {"point_size_adaptive": True, "colour": "elevation"}}),
+        ("groups", {"render": {"positions": "coded"}}),
+        ("groups", {"render": {"positions": "coded", "colour": "#ff8000"}}),
+        ("pools", {"sampling": {"pools": "bytes"}}),
+        ("city", {"render": {"positions": "compact"}}),
+        ("city", {"render": {"style": "splats"}, "splats": {"features": True}}),
+    ],
+    ids=["occupancy", "adaptive", "groups", "groups of one colour", "pools", "compact", "quads"],
+)
+def test_every_form_of_positions_is_drawn_the_same(scenes, tmp_path, name, settings):
+    settings = settings | {
+        "camera": {"width": 96, "height": 64},
+        "render": {"rasterizer": "cpu"} | settings.get("render", {}),
+        "scene": {"path": str(scenes / name)},
+        "output": {"directory": str(tmp_path)},
+    }
+    by_files = Job(parse_config(settings))
+    octree, camera = by_files.load_octree(), by_files.camera(0)
+    chosen = by_files.sampling_node(octree).process(camera, by_files.culling_node(octree).process(camera))
+    assert (chosen.n_pooled > 0) == (name == "pools")
+
+    def drawn(job: Job) -> np.ndarray:
+        with job.open_render(lambda *_: None) as render:
+            return np.array(render.draw(camera, chosen, []).rgba)
+
+    with served(by_files.scene, by_files.colour) as link:
+        elsewhere = parse_config(settings | {"scene": {"path": "not/here"}})
+        received = drawn(receive_job(elsewhere, link))
+    assert np.array_equal(received, drawn(by_files))
+    assert len(np.unique(received.reshape(-1, 4), axis=0)) > (1 if by_files.colouring.mode == "constant" else 50)
 
 
 # --- what is not as it should be ---------------------------------------------------------------------------------

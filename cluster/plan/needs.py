@@ -85,17 +85,16 @@ def _mpi(decision: Decision) -> Part:
 
 
 def _delivery(job: Job, decision: Decision) -> Part:
-    arrays = job.scene.info.arrays
-    read = {"x", "y", "z", "position_codes", "cell_position_bytes", "block_first_point", "block_origin"}
-    read |= {f"attr_{name}" for name in job.attributes_read}
-    sent_mb = 1e-6 * sum(array.bytes for name, array in arrays.items() if name in read)
+    info = job.scene.info
+    read = [*info.position_arrays, "block_first_point", "block_origin"]
+    read += [f"attr_{name}" for name in sorted(job.attributes_read)] + ["pool_codes"] * job.wanted.pools
+    sent_mb = 1e-6 * sum(info.arrays[name].bytes for name in read)
     what, unit = "delivery of the scene by messages", "MB sent once"
     if decision.topology == "single":
         return Part(what, True, "one rank: scene.delivery has no effect, it opens the scene", sent_mb, unit)
     if job.config.scene.delivery == "files":
         return Part(what, True, "scene.delivery is files: every rank opens the scene", sent_mb, unit)
-    form = job.scene.info.positions
-    why = f"scene.delivery is messages: the render rank opens none of its files; positions cross as {form}"
+    why = f"scene.delivery is messages: the render rank opens none of its files; positions cross as {info.positions}"
     return Part(what, False, why, sent_mb, unit)
 
 
