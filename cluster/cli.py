@@ -88,6 +88,7 @@ def build(
     ] = 0.0,
     pools: Annotated[bool, typer.Option("--pools", help="Store dense cells as transformation streams, too.")] = False,
     pool_bits: Annotated[int, typer.Option(help="Pools: bits an axis, up to 8; 0: as suits --points-per-cell.")] = 0,
+    n_pools: Annotated[int, typer.Option(help="Pools: most of a cell.")] = 2,
     strict: Annotated[bool, typer.Option(help="Refuse points that are not finite instead of dropping them.")] = False,
     overwrite: Annotated[bool, typer.Option(help="Replace an existing scene.")] = False,
     json: JsonOption = None,
@@ -116,6 +117,7 @@ def build(
         group_detail=group_detail,
         pools=pools,
         pool_bits=pool_bits,
+        n_pools=n_pools,
         strict=strict,
         overwrite=overwrite,
     )
@@ -336,6 +338,28 @@ def bench_raster(
     from .bench.raster import print_raster
 
     _report(measure(n_points=points, size=size, repeats=repeats), print_raster, json)
+
+
+@bench_app.command("avc")
+def bench_avc(
+    most: Annotated[int, typer.Option(help="Most blocks a side; the paper goes from 16 to 100.", min=16)] = 100,
+    width: Annotated[int, typer.Option(help="Pixels.", min=16, max=8192)] = 1920,
+    height: Annotated[int, typer.Option(help="Pixels.", min=16, max=8192)] = 1200,
+    repeats: Annotated[int, typer.Option(help="Timed frames of each technique.", min=1)] = 5,
+    plot: Annotated[Path | None, typer.Option(help="PNG file for both figures.")] = None,
+    json: JsonOption = None,
+) -> None:
+    """Block worlds as attributed vertex clouds, by instancing, as strips and as triangles.
+
+    Example: `splatpipe bench avc --most 64 --plot avc.png`
+    """
+    from .bench.avc import GRIDS, plot_avc, print_avc
+    from .bench.avc import bench_avc as measure
+
+    found = measure(grids=[n for n in GRIDS if n <= most], width=width, height=height, repeats=repeats)
+    if plot is not None:
+        plot_avc(found, plot)
+    _report(found, print_avc, json)
 
 
 @bench_app.command("splats")

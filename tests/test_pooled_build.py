@@ -7,9 +7,12 @@ import zlib
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from splatpipe.cluster.cli import app
 from splatpipe.nodes.pooled_cells import load_pools
 from splatpipe.nodes.render import load_points
+from splatpipe.shared import pooled
 from splatpipe.shared.build import BuildSettings, build_scene, builder
 from splatpipe.shared.build.pooled import suited_bits
 from splatpipe.shared.build.settings import MemoryPlan
@@ -17,7 +20,7 @@ from splatpipe.shared.codecs import streams
 from splatpipe.shared.codecs.grid import to_grid
 from splatpipe.shared.colour import Colouring
 from splatpipe.shared.errors import StoreError
-from splatpipe.shared.pooled import LEAST_POINTS, PoolCounts, keys_of, points_of, pooled_cells
+from splatpipe.shared.pooled import LEAST_POINTS, CellGrid, PoolCounts, keys_of, points_of, pooled_cells
 from splatpipe.shared.rebuild import rebuild_in_order
 from splatpipe.shared.store import Scene
 from typer.testing import CliRunner
@@ -143,7 +146,7 @@ def test_a_scene_built_anew_in_another_order_keeps_its_pools(scene, tmp_path):
 
 
 def test_bits_that_suit_the_size_of_cells(tmp_path):
-    assert [suited_bits(1 << n) for n in (0, 8, 12, 24)] == sorted(suited_bits(1 << n) for n in (0, 8, 12, 24))
+    assert [suited_bits(1 << n) for n in (0, 8, 12, 14, 16, 24)] == [4, 5, 6, 6, 7, 8]
     assert build(tmp_path / "s", sphere(3000), pool_bits=0).info.pool_bits == suited_bits(1024)
 
 
@@ -154,6 +157,19 @@ def test_keys_and_points_are_each_others_inverse():
     np.testing.assert_array_equal(points[order], points[np.lexsort(points.T[::-1])])
 
 
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(st.integers(1, 8), st.integers(1, 200), st.integers(1, 50), st.integers(0, 10_000))
+def test_distinct_keys_are_found_chunk_by_chunk(bits, n, chunk, seed):
+    """Also of points on the faces of the cube, and a rounding error outside of it."""
+    x, y, z = np.random.default_rng(seed).choice([-0.5 - 1e-7, -0.5, 0.0, 0.1, 0.25, 0.5], (3, n)).astype(np.float32)
+    grid = CellGrid(np.full(3, 0.5), 1.0, bits)
+    expected = np.unique(keys_of(to_grid(np.column_stack([x, y, z]) + 0.5, np.zeros(3), 1.0, bits), bits))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pooled, "_CHUNK", chunk)
+        found = grid.distinct_keys(lambda begin, end: (x[begin:end], y[begin:end], z[begin:end]), 0, n)
+    np.testing.assert_array_equal(found, expected)
+
+
 # --- colours ----------------------------------------------------------------------------------------------------------
 
 
@@ -162,8 +178,8 @@ def test_a_pooled_point_has_the_colour_of_the_first_point_in_its_bin(tmp_path, p
     positions = sphere(4000)
     colour = np.random.default_rng(4).integers(0, 200, 4000).astype(np.uint32)  # few: the palette is exact
     source = ArraySource(positions, {"rgb": colour})
-    settings = BuildSettings(points_per_cell=1024, pools=True, pool_bits=4, point_order=point_order)
-    build_scene([source], tmp_path / "s", settings=settings)
+    options = BuildSettings(points_per_cell=1024, pools=True, pool_bits=4, point_order=point_order)
+    build_scene([source], tmp_path / "s", settings=options)
     scene = Scene.open(tmp_path / "s")
     points = load_points(scene, Colouring.choose(scene, "rgb"), verify=True)
     pools, octree, codes = load_pools(scene, points), scene.octree(pools=True), scene.pool_codes()
@@ -256,11 +272,11 @@ def test_info_says_which_cells_have_pools_and_why_the_others_have_none(scene, tm
     run("info", scene.path, "--json", tmp_path / "i.json")
     told = json.loads((tmp_path / "i.json").read_text())["pooled_cells"]
     octree = scene.octree(pools=True)
-    pooled, few = octree.pool_points > 0, octree.n_points < LEAST_POINTS
+    kept, few = octree.pool_points > 0, octree.n_points < LEAST_POINTS
     assert told == [
-        f"{pooled.sum()} of {len(octree)} cells with points have a pooled form",
+        f"{kept.sum()} of {len(octree)} cells with points have a pooled form",
         f"too few points (below 256): {few.sum()}",
-        f"saving less than 25% of three bytes a point: {(~pooled & ~few).sum()}",
+        f"saving less than 25% of three bytes a point: {(~kept & ~few).sum()}",
     ]
 
 

@@ -42,7 +42,8 @@ def build_scene(
 ) -> BuildReport:
     """Build the scene directory ``out`` from all points of the sources.
 
-    progress : called with (``read``, ``bounds`` or ``write``, points done, points in all or None), from any thread.
+    progress : called with (``read``, ``bounds``, ``write``, ``positions`` or ``pools``, points done, points in all or
+        None), from any thread.
     Points that do not fit into ``settings.memory_bytes`` are sorted into runs inside ``.OUT.partial`` and built
     partition by partition; cells, sets and their order are the same for any memory and any number of threads, the
     place of a cell's range in the point-array is not. Neighbours, for normals and radii, are searched inside a

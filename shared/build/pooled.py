@@ -21,8 +21,16 @@ _POINT_BYTES = 100
 
 
 def suited_bits(points_per_cell: int) -> int:
-    """Bits an axis of the grid on which cells of a surface with that many points are about saturated."""
-    return int(np.clip(np.round(np.log2(points_per_cell) / 2), 4, 8))
+    """Bits an axis of the pooled form's grid, 4 … 8, for which frames take least bytes, about.
+
+    On √``points_per_cell`` bins an axis, where the set of an inner cell still suffices at the largest size at which its
+    form may be drawn, cells of 4096 points are best off: 6 bits. Larger ones want fewer bins than that, half a bit for
+    each four times the points: bins are filled, pools save more (2.6 times rather than 1.8), nearly all cells keep them
+    and encoding takes a fifth of the time, while few cells are drawn as large as more bins would allow. Measured as
+    bytes a frame on the lion, the dragon, the buddha and the demo city, 4096 to 65536 points, thresholds of 32 to 128
+    pixels: no other choice is ahead by more than 0.04 of the bytes without pools on the mean of the four.
+    """
+    return int(np.clip(np.round(np.log2(points_per_cell) / 4 + 2.9), 4, 8))
 
 
 def pool_positions(
