@@ -21,14 +21,23 @@ _POINT_BYTES = 100
 
 
 def suited_bits(points_per_cell: int) -> int:
-    """Bits an axis of the pooled form's grid, 4 … 8, for which frames take least bytes, about.
+    """Bits an axis of the pooled form's grid, 4 … 8, with which frames read least, about.
 
-    On √``points_per_cell`` bins an axis, where the set of an inner cell still suffices at the largest size at which its
-    form may be drawn, cells of 4096 points are best off: 6 bits. Larger ones want fewer bins than that, half a bit for
-    each four times the points: bins are filled, pools save more (2.6 times rather than 1.8), nearly all cells keep them
-    and encoding takes a fifth of the time, while few cells are drawn as large as more bins would allow. Measured as
-    bytes a frame on the lion, the dragon, the buddha and the demo city, 4096 to 65536 points, thresholds of 32 to 128
-    pixels: no other choice is ahead by more than 0.04 of the bytes without pools on the mean of the four.
+    On √n bins an axis, a cell of n points may still be drawn pooled where it is as large as its own set suffices for:
+    6 bits for 4096 points. Of larger cells few are drawn that large; fewer bins than √n are filled, so that nearly all
+    cells keep their pools, which save 2.6 times the bytes rather than 1.7, in a fifth of the time. So: half a bit for
+    each four times the points.
+
+    Bytes that frames read with pools, over those without, geometric mean over distances, mean of lion, dragon, buddha
+    and demo city at a threshold of 32 pixels (* lion and dragon only):
+
+    ======  ======  ======  ======  ======
+    points  5 bits  6 bits  7 bits  8 bits
+    ======  ======  ======  ======  ======
+    4096    0.80    0.75    0.98*
+    16384   1.00*   0.75    0.80
+    65536   1.00*   0.98*   0.74    0.93*
+    ======  ======  ======  ======  ======
     """
     return int(np.clip(np.round(np.log2(points_per_cell) / 4 + 2.9), 4, 8))
 
