@@ -340,6 +340,28 @@ def bench_raster(
     _report(measure(n_points=points, size=size, repeats=repeats), print_raster, json)
 
 
+@bench_app.command("avc")
+def bench_avc(
+    most: Annotated[int, typer.Option(help="Most blocks a side; the paper goes from 16 to 100.", min=16)] = 100,
+    width: Annotated[int, typer.Option(help="Pixels.", min=16, max=8192)] = 1920,
+    height: Annotated[int, typer.Option(help="Pixels.", min=16, max=8192)] = 1200,
+    repeats: Annotated[int, typer.Option(help="Timed frames of each technique.", min=1)] = 5,
+    plot: Annotated[Path | None, typer.Option(help="PNG file for both figures.")] = None,
+    json: JsonOption = None,
+) -> None:
+    """Block worlds as attributed vertex clouds, by instancing, as strips and as triangles.
+
+    Example: `splatpipe bench avc --most 64 --plot avc.png`
+    """
+    from .bench.avc import GRIDS, plot_avc, print_avc
+    from .bench.avc import bench_avc as measure
+
+    found = measure(grids=[n for n in GRIDS if n <= most], width=width, height=height, repeats=repeats)
+    if plot is not None:
+        plot_avc(found, plot)
+    _report(found, print_avc, json)
+
+
 @bench_app.command("splats")
 def bench_splats(
     scenes: Annotated[list[Path], typer.Argument(help="Scenes built with --features.")],

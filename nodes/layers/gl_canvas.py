@@ -6,6 +6,7 @@ drew those, by the minimum of words.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Self
 
@@ -77,6 +78,35 @@ class GlLayers:
         """Release the context and with it all device memory."""
         self._context.release()
 
+    @property
+    def resident_bytes(self) -> tuple[int, int]:
+        """Device memory of all records and vertices, and how much of it is templates of instancing."""
+        return sum(layer.resident_bytes for layer in self._layers), sum(layer.static_bytes for layer in self._layers)
+
+    def timed_draw(self, camera: Camera, entries: Sequence[np.ndarray], *, rasterized: bool) -> float:
+        """Seconds until the device has drawn the layers, nothing read back; else only made their geometry."""
+        import moderngl
+
+        with self._context:
+            self._begin()
+            self._context.finish()
+            started = time.perf_counter()
+            if not rasterized:
+                self._context.enable(moderngl.RASTERIZER_DISCARD)
+            for layer, chosen in zip(self._layers, entries, strict=True):
+                layer.draw(camera, chosen)
+            self._context.finish()
+            seconds = time.perf_counter() - started
+            if not rasterized:
+                self._context.disable(moderngl.RASTERIZER_DISCARD)
+            check_errors(self._context, "drawing layers")
+        return seconds
+
+    def _begin(self) -> None:
+        self._words.write(self._empty)
+        self._depth_only.clear(depth=1.0)
+        self._framebuffer.use()
+
     def draw(self, camera: Camera, entries: Sequence[np.ndarray]) -> np.ndarray:
         """(height, width) uint64 framebuffer words; valid until the next call.
 
@@ -84,9 +114,7 @@ class GlLayers:
         Raises MessageError for an entry beyond the objects, DeviceError for an OpenGL error.
         """
         with self._context:
-            self._words.write(self._empty)
-            self._depth_only.clear(depth=1.0)
-            self._framebuffer.use()
+            self._begin()
             for layer, chosen in zip(self._layers, entries, strict=True):
                 layer.draw(camera, chosen)
             self._words.read_into(self._image)

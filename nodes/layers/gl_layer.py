@@ -64,6 +64,8 @@ class GlLayer(ABC):
         return self._resident_bytes
 
     _resident_bytes = 0
+    static_bytes = 0
+    """Of ``resident_bytes``: a template that is there once, however many objects there are."""
 
     def draw(self, camera: Camera, entries: np.ndarray) -> None:
         """Draw objects into the framebuffer in use, in one call. Raises MessageError for entries beyond the objects."""
