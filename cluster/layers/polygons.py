@@ -34,6 +34,7 @@ def polygons(
     kind: Annotated[
         list[str] | None, typer.Option("--type", help="City objects to take. Default: Building, BuildingPart.")
     ] = None,
+    boxes: Annotated[bool, typer.Option("--boxes", help="Make cuboids: the box around each object.")] = False,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Prisms over outlines, as buildings: GeoJSON polygons with a height, CityJSON with solids or footprints.
@@ -43,13 +44,13 @@ def polygons(
 
     Example: `splatpipe layer polygons city.geojson --height-property levels --height-scale 3 -o city.layer`
     """
-    from ...shared.layers.readers.footprints import HeightRules, polygons_from_file
+    from ...shared.layers.readers.footprints import HeightRules, bounding_boxes, polygons_from_file
 
     for name, number in (("--height", height), ("--height-scale", height_scale), ("--base", base)):
         if not abs(number) <= 1e12:
             raise InputError(f"{name}: found {number:g}, expected a number, at most 1e12")
     rules = HeightRules(height, height_property, height_scale, base, value_property)
     read = polygons_from_file(source, rules, degrees=degrees, types=kind)
-    save(read.layer, output, overwrite)
+    save(bounding_boxes(read.layer) if boxes else read.layer, output, overwrite)
     for note in read.notes:
         typer.echo(f"  {note}")

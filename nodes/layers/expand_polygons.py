@@ -12,11 +12,10 @@ CENTER_BELOW, END_BELOW, START_BELOW, END_ABOVE, START_ABOVE, CENTER_ABOVE = ran
 DOWN, OUT, UP = range(3)
 """Its normals."""
 
-_WHOLE = ([0, 0, 2, 1, 4, 3, 5, 5], [DOWN] * 4 + [OUT] * 2 + [UP] * 2)
-_SIDE = ([1, 1, 2, 3, 4, 4], [OUT] * 6)
-_ENDS = ([0, 0, 2, 1, 1, 1, 3, 3, 4, 5, 5, 5], [DOWN] * 6 + [UP] * 6)
-"""Strips of vertices and the normals of these. Their ends are there twice, so that a strip can follow another; so what
-they draw begins with their second triangle, and every second triangle is turned."""
+_WHOLE = ([0, 0, 1, 2, 3, 4, 5, 5], [DOWN] * 4 + [OUT] * 2 + [UP] * 2)
+_SIDE = ([1, 1, 3, 2, 4, 4], [OUT] * 6)
+_ENDS = ([0, 0, 1, 2, 2, 2, 4, 4, 3, 5, 5, 5], [DOWN] * 6 + [UP] * 6)
+"""Strips of vertices and the normals of these. Their ends are there twice, so that a strip can follow another."""
 
 
 def triangles(layer: Layer) -> Mesh:
@@ -42,6 +41,11 @@ def strips(layer: Layer) -> Mesh:
         vertex[case, : len(strip)], normal[case, : len(strip)] = strip, its_normals
     case = side + 2 * ends
     wedge, place = np.nonzero(vertex[case] >= 0)
+    object_of = np.repeat(np.arange(len(layer)), np.diff(layer.first_element))
+    follows = (
+        np.diff(object_of[wedge], prepend=-1) == 0
+    )  # an object's first vertex is there once: triangles 0, 2 … are not turned
+    wedge, place = wedge[follows], place[follows]
     code = case[wedge], place
     count = np.bincount(wedge, minlength=len(case))
     return _mesh(layer, vertices[wedge, vertex[code]], normals[wedge, normal[code]], count, is_strip=True)

@@ -1,9 +1,9 @@
 """Outlines → fans: outlines, concave, with holes, crossing themselves, as pieces that wedges around a vertex fill.
 
 The paper's wedges, from a centre to each edge, fill star-shaped outlines only. So outlines are triangulated once, when
-a layer is built, and the triangles around a vertex joined to *fans*: closed loops that are star-shaped as seen from
-their first vertex, the *apex*. A fan of k edges makes k − 2 triangles (a centre would make k), and no new point but
-where edges cross.
+a layer is built, and neighbouring triangles joined to *fans*: closed loops that are star-shaped as seen from their
+first vertex, the *apex*. A fan of k edges makes k − 2 triangles (a centre would make k), and no new point but where
+edges cross. A convex outline is one fan.
 
 Inside is what a ray leaves across an odd number of edges (even-odd). So the direction of rings does not matter, rings
 inside rings are holes, an edge that is there twice (the cut of a keyhole, the wall between two faces) vanishes, and an
@@ -15,7 +15,7 @@ Coordinates are integers, so that which side a point lies on is exact:
 2. edges that are there an even number of times vanish;
 3. a sweep along x triangulates what is between the rest: Hertel, Mehlhorn, "Fast triangulation of the plane with
    respect to simple polygons" (1985);
-4. triangles around a vertex are joined, the longest runs first.
+4. neighbours are joined while the piece is convex, then while one of its vertices sees all of it.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ _SHIFT = COORDINATE_BITS + 2
 _HALF = 1 << COORDINATE_BITS
 _MASK = (1 << _SHIFT) - 1
 _ROUNDS = 64
+_STAR = 64  # edges of the largest piece of which it is tried whether a vertex sees all of it
 DONE, TOO_MANY_CROSSINGS, NOT_SETTLED = 0, 1, 2
 
 
@@ -66,7 +67,7 @@ def _fans(start, end):
     points = np.unique(np.concatenate((low, high)))
     low, high = np.searchsorted(points, low), np.searchsorted(points, high)
     corners = _triangles(points >> _SHIFT, points & _MASK, low, high)
-    point, apex, side = _joined(corners, len(points))
+    point, apex, side = _joined(points >> _SHIFT, points & _MASK, corners)
     return points[point], points[apex], side, status
 
 
@@ -305,64 +306,110 @@ def _below(corners, n_corners, vertex, before, after, n_nodes, x, y, node, v):
 
 
 @njit(nogil=True, cache=True)
-def _joined(corners, n):
-    """Loops of vertices around an apex each, from (t, 3) triangles of n vertices; and which edges have one side only.
+def _joined(x, y, corners):
+    """Loops of vertices around an apex each, from (t, 3) triangles; and which edges have one side only.
 
-    Half-edge 3 t + i goes from corner i of triangle t to the next.
+    Half-edge 3 t + i goes from corner i of triangle t to the next. Pieces are loops of half-edges, at first the
+    triangles; those on both sides of an edge become one where that is convex, then where a vertex sees all of it.
+    No three neighbours of a loop are in line as its apex sees them: all vertices are corners of triangles, so that
+    nothing shines through where these meet.
     """
     n_half = 3 * len(corners)
     origin = corners.ravel()
-    target = np.empty(n_half, np.int64)
+    onward, back = np.empty(n_half, np.int64), np.empty(n_half, np.int64)
     for h in range(n_half):
-        target[h] = origin[h - h % 3 + (h + 1) % 3]
-    key = origin * n + target
-    order = np.argsort(key)
-    found = np.minimum(np.searchsorted(key[order], target * n + origin), n_half - 1)
-    twin = order[found]
-    for h in range(n_half):
-        if origin[twin[h]] != target[h] or target[twin[h]] != origin[h]:
-            twin[h] = -1
-    count = np.bincount(origin, minlength=n)
-    begin = np.cumsum(count) - count
-    from_vertex = np.argsort(origin, kind="mergesort")
-    free = np.ones(len(corners), np.bool_)
-    point, apex = np.empty(2 * n_half, np.int64), np.empty(2 * n_half, np.int64)
+        onward[h], back[h] = h - h % 3 + (h + 1) % 3, h - h % 3 + (h + 2) % 3
+    twin = _twins(origin, origin[onward], len(x))
+    seer = np.arange(n_half)  # at the root of a piece: the half-edge whose origin is its apex
+    root = np.arange(n_half) // 3 * 3
+    size = np.full(n_half, 3)
+    convex = np.ones(n_half, np.bool_)
+    inner = np.zeros(n_half, np.bool_)
+    loop = np.empty(2 * _STAR, np.int64)
+    for stars in (False, True, True):
+        for h in range(n_half):
+            t = twin[h]
+            if t < h or inner[h]:  # also without twin; each edge once
+                continue
+            one, other = _root(root, h), _root(root, t)
+            if one == other:
+                continue
+            a, b = origin[h], origin[t]
+            c, d = origin[back[h]], origin[onward[onward[t]]]
+            e, f = origin[back[t]], origin[onward[onward[h]]]
+            both = convex[one] and convex[other]
+            both = (
+                both and _turn(x[c], y[c], x[a], y[a], x[d], y[d]) > 0 and _turn(x[e], y[e], x[b], y[b], x[f], y[f]) > 0
+            )
+            apex = onward[h]
+            if not both:
+                if not stars or size[one] + size[other] - 2 > _STAR:
+                    continue
+                apex = _star(x, y, origin, onward, h, t, loop)
+                if apex == -1:
+                    continue
+            onward[back[h]], back[onward[t]] = onward[t], back[h]
+            onward[back[t]], back[onward[h]] = onward[h], back[t]
+            inner[h] = inner[t] = True
+            root[other] = one
+            size[one] += size[other] - 2
+            convex[one], seer[one] = both, apex
+    point, apexes = np.empty(2 * n_half, np.int64), np.empty(2 * n_half, np.int64)
     side = np.zeros(2 * n_half, np.bool_)
     made = 0
-    by_count = np.argsort(-count, kind="mergesort")
-    for least in (4, 2, 1):
-        for p in by_count:
-            if count[p] < least:
-                break
-            for h in from_vertex[begin[p] : begin[p] + count[p]]:
-                if not free[h // 3]:
-                    continue
-                while twin[h] != -1 and free[twin[h] // 3]:  # clockwise to where the run begins
-                    h = _next(twin[h])
-                length, last = 1, h
-                while True:
-                    onward = twin[_next(_next(last))]
-                    if onward == -1 or not free[onward // 3]:
-                        break
-                    length, last = length + 1, onward
-                if length < least:
-                    continue
-                apex[made : made + length + 3] = p
-                point[made], side[made] = p, twin[h] == -1
-                made += 1
-                for _ in range(length):
-                    outer, inner = _next(h), _next(_next(h))
-                    free[h // 3] = False
-                    point[made], side[made] = origin[outer], twin[outer] == -1
-                    made += 1
-                    h = twin[inner]
-                point[made], side[made] = origin[inner], twin[inner] == -1
-                point[made + 1] = p
-                made += 2
-    return point[:made], apex[:made], side[:made]
+    for piece in range(0, n_half, 3):
+        if root[piece] != piece:
+            continue
+        h = seer[piece]
+        apexes[made : made + size[piece] + 1] = origin[h]
+        for _ in range(size[piece]):
+            point[made], side[made] = origin[h], twin[h] == -1
+            made, h = made + 1, onward[h]
+        point[made] = origin[h]
+        made += 1
+    return point[:made], apexes[:made], side[:made]
 
 
 @njit(nogil=True, cache=True)
-def _next(h):
-    """The next half-edge of the same triangle."""
-    return h - h % 3 + (h + 1) % 3
+def _twins(origin, target, n):
+    """The half-edge that goes the other way, −1 where there is none."""
+    key = origin * n + target
+    order = np.argsort(key)
+    found = np.minimum(np.searchsorted(key[order], target * n + origin), len(key) - 1)
+    twin = order[found]
+    for h in range(len(key)):
+        if origin[twin[h]] != target[h] or target[twin[h]] != origin[h]:
+            twin[h] = -1
+    return twin
+
+
+@njit(nogil=True, cache=True)
+def _root(root, h):
+    """The half-edge that stands for the piece of a half-edge."""
+    at = h - h % 3
+    while root[at] != at:
+        root[at] = root[root[at]]
+        at = root[at]
+    return at
+
+
+@njit(nogil=True, cache=True)
+def _star(x, y, origin, onward, h, t, loop):
+    """A half-edge from whose origin the loops on both sides of an edge can all be seen, −1 where there is none."""
+    n = 0
+    for first, last in ((onward[h], h), (onward[t], t)):
+        at = first
+        while at != last:
+            loop[n] = at
+            n, at = n + 1, onward[at]
+    for i in range(n):
+        p = origin[loop[i]]
+        sees = True
+        for j in range(1, n - 1):
+            a, b = origin[loop[(i + j) % n]], origin[loop[(i + j + 1) % n]]
+            if _turn(x[p], y[p], x[a], y[a], x[b], y[b]) <= 0:
+                sees = False
+                break
+        if sees:
+            return loop[i]
+    return -1

@@ -88,7 +88,8 @@ def polygon_layer(
         elements += made
     kept = np.flatnonzero(count)
     objects = np.empty(len(kept), OBJECT)
-    objects["height"], objects["value"] = height[kept] - origin[2], value[kept]
+    with np.errstate(over="ignore"):  # beyond float32: found below
+        objects["height"], objects["value"] = height[kept] - origin[2], value[kept]
     first = np.concatenate([[0], np.cumsum(count[kept])])
     layer = Layer(
         name, "polygons", origin, objects, np.concatenate([np.empty(0, ELEMENT), *elements]), first, parameters

@@ -26,10 +26,10 @@ void main() {
         }
         emit(center_above, UP, colour);
     } else if (wedge[0].has_side == 1) {
-        emit(start, normal, colour);
         emit(end, normal, colour);
-        emit(start_above, normal, colour);
         emit(end_above, normal, colour);
+        emit(start, normal, colour);
+        emit(start_above, normal, colour);
     }
     EndPrimitive();
 }

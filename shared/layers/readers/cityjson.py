@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from ...errors import InputError
 from .footprints import Footprint, Footprints
-from .json_file import expect_list, numbers, wrong
+from .json_file import LARGEST, expect_list, numbers, wrong
 
 BUILDINGS = ("Building", "BuildingPart")
 
@@ -41,7 +42,7 @@ def read_cityjson(path: Path, content: dict[str, Any], types: Sequence[str] = BU
             raise wrong(path, where, city_object, "an object")
         kind, geometry = city_object.get("type"), city_object.get("geometry", [])
         if kind not in types:
-            left_out[kind if isinstance(kind, str) else "no type"] += 1
+            left_out[f"{kind[:40]!a}"[1:-1] if isinstance(kind, str) else "no type"] += 1
         elif expect_list(path, f"{where}.geometry", geometry, "a list of geometries"):
             chosen[name] = where, city_object
     found = []
@@ -70,7 +71,10 @@ def _vertices(path: Path, content: dict[str, Any]) -> np.ndarray:
     scale, translate = (
         numbers(path, f"transform.{key}", [transform.get(key)], 3, 3)[0] for key in ("scale", "translate")
     )
-    return vertices * scale + translate
+    vertices = vertices * scale + translate
+    if not (np.abs(vertices) <= LARGEST).all():
+        raise InputError(f"{path}: transform: found vertices beyond {LARGEST:g}, expected finite numbers")
+    return vertices
 
 
 def _footprint(path: Path, where: str, city_object: dict[str, Any], vertices: np.ndarray) -> Footprint | None:

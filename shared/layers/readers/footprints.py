@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 
 from ...errors import InputError
-from ..layer import Layer
+from .. import cuboids
+from ..layer import Layer, simple_layer
+from ..polygons import bounds as polygon_bounds
 from ..polygons import polygon_layer
 from .json_file import read_json
 
@@ -110,6 +112,15 @@ def polygons_from_file(
     return Read(layer, notes)
 
 
+def bounding_boxes(layer: Layer) -> Layer:
+    """The boxes of polygons, along the axes, as cuboids."""
+    lower, upper = polygon_bounds(layer)
+    objects = np.empty(len(layer), cuboids.OBJECT)
+    objects["center"], objects["extent"] = (lower + upper)[:, :2] / 2, (upper - lower)[:, :2]
+    objects["height"], objects["value"] = layer.objects["height"], layer.objects["value"]
+    return simple_layer(layer.name, "cuboids", layer.origin, objects, **layer.parameters)
+
+
 def read_footprints(path: Path, types: Sequence[str] | None = None) -> Footprints:
     """The footprints of a GeoJSON or CityJSON file, whichever it is. Raises InputError naming the entry."""
     from . import cityjson, geojson
@@ -125,7 +136,7 @@ def read_footprints(path: Path, types: Sequence[str] | None = None) -> Footprint
 
 
 def _among(left_out: Counter[str]) -> str:
-    several = [f"{n:,} {what[:40]}" for what, n in left_out.most_common(8) if n]
+    several = [f"{n:,} {what}" for what, n in left_out.most_common(8) if n]
     return f": {', '.join(several)}" if several else ""
 
 
@@ -134,7 +145,7 @@ def number_of(value: Any) -> float | None:
     if isinstance(value, str):
         matched = re.fullmatch(r"\s*([-+]?\d{1,12}(?:\.\d{0,12})?)\s*m?\s*", value, re.ASCII)
         return float(matched[1]) if matched else None
-    if type(value) not in (int, float) or not abs(value) <= 1e30:
+    if type(value) not in (int, float) or not abs(value) <= 1e18:
         return None
     return float(value)
 

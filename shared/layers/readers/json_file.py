@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -13,6 +12,9 @@ from ...errors import InputError
 
 MAX_BYTES = 1 << 29
 """Of a file: its content takes ten to twenty times as much memory."""
+
+LARGEST = 1e30
+"""Of numbers: those above are taken for errors, as what is not finite."""
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -77,5 +79,5 @@ def numbers(path: Path, where: str, value: Any, least: int, most: int) -> np.nda
 
 
 def is_finite(number: float) -> bool:
-    """Whether a number of JSON is finite as float64: integers may have any number of digits."""
-    return abs(number) <= 1e300 if isinstance(number, int) else math.isfinite(number)
+    """Whether a number of JSON is one to reckon with: it may have any number of digits."""
+    return abs(number) <= LARGEST
