@@ -50,6 +50,7 @@ PositionReader = Callable[[int, int], np.ndarray]
 """(3, stop − start) float32 of the stored points ``start`` … ``stop`` − 1."""
 
 _CHUNK = 1 << 22
+_POSITION_BYTES = 12
 
 
 class Scene:
@@ -137,16 +138,18 @@ class Scene:
             columns = self.positions()
             return lambda start, stop: np.stack([column[start:stop] for column in columns])
         coded, threads = self.coded_positions(), len(os.sched_getaffinity(0))
+        memory_bytes = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
         def read(start: int, stop: int) -> np.ndarray:
+            if _POSITION_BYTES * (stop - start) > memory_bytes:  # what repeats takes hardly a byte of code
+                raise StoreError(
+                    f"{self.path}/position_codes.npy: found {stop - start} points, expected as many as fit into the "
+                    f"{memory_bytes} bytes of this machine's memory"
+                )
             try:
                 return coded.columns(start, stop, threads)
             except CodecError as error:
                 raise StoreError(f"{self.path}/position_codes.npy: {error}") from error
-            except MemoryError:
-                raise StoreError(
-                    f"{self.path}/position_codes.npy: found {stop - start} points, expected as many as fit into memory"
-                ) from None
 
         return read
 

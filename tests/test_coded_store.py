@@ -393,7 +393,7 @@ def test_damaged_codes_are_told_and_nothing_else_happens(copied, order, codec):
     codes = np.load(path / "position_codes.npy")
     rng = np.random.default_rng(3)
     refused = 0
-    for _ in range(60):
+    for _ in range(30):
         damaged = codes.copy()
         damaged[rng.integers(len(codes), size=rng.integers(1, 4))] ^= rng.integers(1, 256, dtype=np.uint8)
         np.save(path / "position_codes.npy", damaged)
@@ -483,6 +483,17 @@ def test_codes_of_more_points_than_the_cell_has_are_refused(copied):
     rewrite(path, "cell_position_bytes", n_bytes)
     rewrite(path, "position_codes", codes, position_bytes=len(codes))
     with pytest.raises(StoreError, match=rf"cell {coded.cells.cell[0]}: .*more than {n} points"):
+        Scene.open(path).positions()
+
+
+def test_more_points_than_memory_holds_are_refused(tmp_path):
+    """No attribute's file bounds their number, and what repeats takes hardly a byte."""
+    path = tmp_path / "s"
+    build_scene([ArraySource(np.ones((50, 3)))], path, settings=BuildSettings(positions="eci"))
+    many = 1 << 45
+    for name in ("cell_n_points", "cell_n_below"):
+        rewrite(path, name, np.array([many]), n_points=many, n_stored=many)
+    with pytest.raises(StoreError, match=rf"position_codes\.npy: found {many} points, expected as many as fit"):
         Scene.open(path).positions()
 
 
