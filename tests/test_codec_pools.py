@@ -50,12 +50,13 @@ def test_the_pool_of_figure_3():
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)
-@given(point_sets(), st.sampled_from([1, 7, 256]))
-def test_counts_are_those_of_all_pairs(points, size):
-    expected = reference.translation_counts(points)
+@given(point_sets(), st.sampled_from([1, 7, 256]), st.sampled_from([None, 0, 2, 5]))
+def test_counts_are_those_of_all_pairs(points, size, longest):
+    reach = MAX_REACH if longest is None else longest
+    expected = {t: n for t, n in reference.translation_counts(points).items() if max(map(abs, t)) <= reach}
     least = len(points) * LEAST_SHARE
     ranked = sorted((t for t in expected if expected[t] >= least), key=lambda t: (-expected[t], max(map(abs, t)), t))
-    translations, counts = common_translations(points, size)
+    translations, counts = common_translations(points, size, longest)
     assert list(map(tuple, translations.tolist())) == ranked[:size]
     assert counts.tolist() == [expected[t] for t in ranked[:size]]
 

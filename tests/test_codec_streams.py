@@ -176,24 +176,6 @@ def test_the_gate():
     assert not streams.keeps_pools(streams.read_pools(streams.encode(sparse, 7).data, 7, 500), least_gain=1)
 
 
-def test_a_search_that_promises_too_little_is_given_up():
-    """Pools that pay are those of a full search; what is given up holds the same points."""
-    rng = np.random.default_rng(5)
-    for share in (1.0, 0.4):
-        points = surface(64)
-        points = points[rng.random(len(points)) < share]
-        full = streams.encode(points, 7)
-        quick = streams.encode(points, 7, least_gain=streams.LEAST_GAIN)
-        kept = streams.keeps_pools(streams.read_pools(full.data, 7, len(points)))
-        assert kept == (share == 1.0)
-        if kept:
-            np.testing.assert_array_equal(quick.data, full.data)
-        else:
-            assert streams.read_pools(full.data, 7, len(points)).pools
-            assert not streams.read_pools(quick.data, 7, len(points)).pools
-        np.testing.assert_array_equal(streams.decode(quick.data, 7, len(points)), points[quick.order])
-
-
 @pytest.mark.parametrize(
     ("file", "n_distinct", "bytes_per_point", "coverage"),
     [

@@ -14,7 +14,7 @@ from splatpipe.nodes.pooled_cells import load_pools
 from splatpipe.nodes.render import load_points
 from splatpipe.shared import pooled
 from splatpipe.shared.build import BuildSettings, build_scene, builder
-from splatpipe.shared.build.pooled import suited_bits
+from splatpipe.shared.build.pooled import LONGEST, suited_bits
 from splatpipe.shared.build.settings import MemoryPlan
 from splatpipe.shared.codecs import streams
 from splatpipe.shared.codecs.grid import to_grid
@@ -88,7 +88,7 @@ def test_the_gate_drops_what_does_not_pay(scene):
     assert not (kept & ~tried).any()
     for cell in np.flatnonzero(tried):
         points = np.unique(distinct_grid_points(scene, octree, cell), axis=0)
-        data = streams.encode(points, octree.pool_bits, 2).data
+        data = streams.encode(points, octree.pool_bits, 2, longest=LONGEST).data
         pays = streams.keeps_pools(streams.read_pools(data, octree.pool_bits, len(points)))
         assert kept[cell] == pays
         assert octree.pool_bytes[cell] == (len(data) if pays else 0)

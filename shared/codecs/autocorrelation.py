@@ -17,7 +17,6 @@ Source: Kim, Lee, Varshney, "Vertex Transformation Streams", section 5, equation
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -40,38 +39,31 @@ FLOAT32_POINTS = 1 << 16
 _FIRST_REACH = 12
 
 
-def common_translations(points: np.ndarray, size: int = PALETTE_SIZE) -> tuple[np.ndarray, np.ndarray]:
+def common_translations(
+    points: np.ndarray, size: int = PALETTE_SIZE, longest: int | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """The most common translations between (n, 3) distinct grid points, and how many points each takes to another.
 
-    Returns (m, 3) int64, each axis in −127 … 127, and (m,) int64 counts; m ≤ size, counts ≥ n · ``LEAST_SHARE``. The
-    first is no translation at all, of count n; t and −t are two. Most common first, of equal ones the one that is
+    longest : along an axis; None: ``MAX_REACH``. A short one spares the proof that no longer one is more common.
+    Returns (m, 3) int64, each axis in −longest … longest, and (m,) int64 counts; m ≤ size, all ≥ n · ``LEAST_SHARE``.
+    The first is no translation at all, of count n; t and −t are two. Most common first, of equal ones the one that is
     shorter along its longest axis, then by x, y, z.
     Cost: O(N log N) time and 16 bytes for each of the N values of the padded grid (32 in float64); n > 0.
-    """
-    *_, (translations, counts, _) = translation_rounds(points, size)
-    return translations, counts
-
-
-def translation_rounds(points: np.ndarray, size: int = PALETTE_SIZE) -> Iterator[tuple[np.ndarray, np.ndarray, bool]]:
-    """As ``common_translations``, for each reach in turn: the most common translations among those that are no longer,
-    and whether the counts prove that there are no others; that round is the last.
     """
     lower = points.min(axis=0).astype(np.int64)
     extent = points.max(axis=0) - lower + 1
     least = max(1, int(np.ceil(len(points) * LEAST_SHARE)))
-    longest = np.minimum(extent - 1, MAX_REACH)
-    reach = np.minimum(longest, _FIRST_REACH)
+    most_reach = np.minimum(extent - 1, MAX_REACH if longest is None else longest)
+    reach = np.minimum(most_reach, _FIRST_REACH)
     while True:
         counts = circular_counts(points - lower, padded_shape(extent, reach))
         window = np.ix_(*(np.arange(-r, r + 1) for r in reach))
         inside = np.rint(counts[window]).astype(np.int64)
         counts[window] = 0
         translations, found = _most_common(inside, reach, least, size)
-        proven = (reach == longest).all() or np.rint(counts.max()) < (found[-1] + 1 if len(found) == size else least)
-        yield translations, found, bool(proven)
-        if proven:
-            return
-        reach = np.minimum(longest, 2 * reach)
+        if (reach == most_reach).all() or np.rint(counts.max()) < (found[-1] + 1 if len(found) == size else least):
+            return translations, found
+        reach = np.minimum(most_reach, 2 * reach)
 
 
 def padded_shape(extent: np.ndarray, reach: np.ndarray) -> tuple[int, ...]:

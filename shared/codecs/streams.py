@@ -49,10 +49,6 @@ POINT_BYTES = 3
 LEAST_GAIN = 4 / 3
 """Pools are worth having where the points without them would need this many times the bytes."""
 
-PROMISE = 0.85
-"""Share of a gain that short translations must show, for longer ones to be looked for. On the cells of the scans, those
-made the gain at most 1.09 times as large."""
-
 
 @dataclass(frozen=True)
 class PooledPoints:
@@ -85,13 +81,12 @@ def encode(
     bits: int = DEFAULT_BITS,
     n_pools: int = 2,
     width: int | None = None,
-    least_gain: float = 0.0,
+    longest: int | None = None,
 ) -> Encoded:
     """(n, 3) integers in [0, 2**bits), duplicates allowed. Raises CodecError for anything else.
 
     n_pools : most pools; those that save no bytes are left out.  width : translations that a tag has room for, a
-    multiple of 32 up to 256; None: what saves most.  least_gain : where short translations promise less than this, the
-    search is given up and no pool made, which takes half the time or less.
+    multiple of 32 up to 256; None: what saves most.  longest : translation along an axis; None: 127.
     """
     points = check_points(points, bits)
     _check_bits(bits)
@@ -103,7 +98,7 @@ def encode(
     first, counts = distinct(keys[order])
     if not len(points):
         return Encoded(write_head(counts), order)
-    pools, which = find_pools(points[order[first]], n_pools, width, least_gain)
+    pools, which = find_pools(points[order[first]], n_pools, width, longest)
     data = [write_head(counts[which]), write_varints(np.array([len(pools)]))]
     data += [write_varints(np.array([len(pool.vertices), len(pool.translations)])) for pool in pools]
     for pool in pools:
@@ -117,20 +112,17 @@ def encode(
     return Encoded(np.concatenate(data), gather_runs(order, first, counts, which))
 
 
-def find_pools(points: np.ndarray, n_pools: int, width: int | None, least_gain: float) -> tuple[list[Pool], np.ndarray]:
+def find_pools(
+    points: np.ndarray, n_pools: int, width: int | None, longest: int | None
+) -> tuple[list[Pool], np.ndarray]:
     """Pools of (n, 3) distinct grid points, n > 0, and (n,) int64: the points in coded order."""
-    from .autocorrelation import translation_rounds
+    from .autocorrelation import common_translations
 
-    for translations, _, proven in translation_rounds(points) if n_pools > 0 else ():
-        if not (proven or least_gain):
-            continue
-        pools, covered, loose = greedy_pools(points, translations, n_pools, width)
-        if proven:
-            return pools, np.concatenate([covered, loose])
-        n_bytes = POINT_BYTES * len(points) - sum(pool.saved_bytes for pool in pools)
-        if POINT_BYTES * len(points) < PROMISE * least_gain * n_bytes:
-            break
-    return [], np.arange(len(points))
+    if n_pools <= 0:
+        return [], np.arange(len(points))
+    translations, _ = common_translations(points, longest=longest)
+    pools, covered, loose = greedy_pools(points, translations, n_pools, width)
+    return pools, np.concatenate([covered, loose])
 
 
 def decode(data: np.ndarray, bits: int, most_points: int) -> np.ndarray:
