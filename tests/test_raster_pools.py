@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import stream_example as example
-from splatpipe.nodes.raster import PointSize, kernels
+from splatpipe.nodes.raster import PointSize, kernels, tags
 from splatpipe.nodes.raster.blocks import frustum
 from splatpipe.nodes.raster.cpu import CpuRasterizer
 from splatpipe.nodes.raster.pools import ROUNDING, PoolCell, draw_pools, pool_cells
@@ -152,3 +152,39 @@ def test_many_colours_become_256_that_are_alike():
     off = unpack_rgb(palette[index]).astype(int) - unpack_rgb(words)
     assert (off[:, 3] == 0).all()
     assert np.sqrt((off**2).mean()) < 6
+
+
+@pytest.mark.parametrize(
+    "expand",
+    [
+        tags.expand_tag_plain,
+        pytest.param(
+            tags.expand_tag_by_bytes, marks=pytest.mark.skipif(not tags.has_avx2(), reason="a processor without AVX2")
+        ),
+    ],
+    ids=["plain", "by bytes"],
+)
+def test_tags_name_their_sums_in_order(expand):
+    """Every byte at every place of a tag, few bits and many: the same sums, one after the other."""
+    rng = np.random.default_rng(5)
+    by_byte = [byte << shift for byte in range(256) for shift in (0, 8, 16, 24)]
+    words = np.array([*by_byte, *rng.integers(0, 2**32, 300), 0xFFFFFFFF], np.uint32)
+    vertices, offsets = rng.normal(size=(len(words), 3)).astype(np.float32), rng.normal(size=(3, 64)).astype(np.float32)
+    out = np.zeros((3, 32 * len(words) + tags.SLACK), np.float32)
+    n, expected = 0, []
+    for i, (word, vertex) in enumerate(zip(words, vertices, strict=True)):
+        at = 32 * (i % 2)
+        n = expand(word, *vertex, *offsets, at, *out, n)
+        expected += [vertex + offsets[:, at + bit] for bit in range(32) if int(word) >> bit & 1]
+    assert n == len(expected)
+    np.testing.assert_array_equal(out[:, :n].T, expected)
+
+
+def test_cells_beside_the_image_change_nothing():
+    """A cell on each side, behind the eye, and one that only just reaches in: as if none were left out."""
+    around = [(-40, 0, 0), (40, 0, 0), (0, -40, 0), (0, 40, 0), (0, 0, -40), (0, 0, 40), (0.9, -1.6, 0.4)]
+    cells = [cell(surface(64), place, 1 / 64, seed) for seed, place in enumerate(around)]
+    for view in (camera(), camera(target=(3.0, 0.2, 0.2)), camera(eye=(0.5, 0.4, 0.5), target=(0.6, 3.0, 0.5))):
+        points = decoded(cells)
+        expected = reference_frame(points, view, everything(points), SIZES[0], project_pools(cells))
+        np.testing.assert_array_equal(draw(cells, view), expected)
