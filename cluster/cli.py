@@ -395,14 +395,28 @@ def bench_codecs(
     ] = 0.5,
     size: Annotated[int, typer.Option(help="Width and height, pixels.", min=16, max=8192)] = 1024,
     repeats: Annotated[int, typer.Option(help="Times that each is measured.", min=1)] = 5,
+    sizes: Annotated[
+        str | None,
+        typer.Option(metavar="M,M,…", help="Million points: frames only, of scenes so large, copied from a few cells."),
+    ] = None,
     json: JsonOption = None,
 ) -> None:
     """Codecs of cells beside float32 and 10-bit fixed point: bytes, encode, decode, error, frame time.
+
+    With `--sizes`: frames drawn from float32, fixed point, pools and groups, and from which size on each is faster than
+    float32; ε is then a share of a cell's edge.
 
     Exit status 1 if what is decoded is not what was encoded.
 
     Example: `splatpipe bench codecs lion.scene dragon.ply --json codecs.json`
     """
+    if sizes is not None:
+        from .bench.codec_sizes import bench_sizes, print_sizes
+
+        million = parse_numbers(sizes, "--sizes")
+        found = bench_sizes(inputs or [], million, bits=bits, epsilon=epsilon / 100, size=size, repeats=repeats)
+        _report(found, print_sizes, json)
+        return
     from .bench.codecs import bench_codecs as measure
     from .bench.codecs import print_codecs
 

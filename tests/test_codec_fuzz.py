@@ -1,12 +1,12 @@
-"""Damaged streams: each gives points, no more than allowed and inside the grid, or one CodecError. 160 000 inputs."""
+"""Damaged streams: each gives points, no more than allowed and inside the grid, or one CodecError. 200 000 inputs."""
 
 import numpy as np
 import pytest
-from splatpipe.shared.codecs import Codec, ci, eci, occupancy
+from splatpipe.shared.codecs import MAX_STREAM_BITS, Codec, ci, eci, occupancy, streams
 from splatpipe.shared.codecs.linear_groups import LinearGroupCodec
 from splatpipe.shared.errors import CodecError
 
-CODECS: list[Codec] = [ci, eci, occupancy, LinearGroupCodec(1.5)]
+CODECS: list[Codec] = [ci, eci, occupancy, streams, LinearGroupCodec(1.5)]
 N_INPUTS = 40_000
 MOST_POINTS = 300
 
@@ -14,11 +14,14 @@ MOST_POINTS = 300
 def valid_streams(codec, rng):
     """(bits, data) of small clouds: sparse, dense, with repeats, in one block and in several."""
     for bits in (1, 2, 3, 5, 6, 8, 21):
+        if codec is streams and bits > MAX_STREAM_BITS:
+            continue
         for n in (1, 5, 40):
             points = rng.integers(0, min(1 << bits, 40), (n, 3))
             yield bits, codec.encode(points, bits).data
             yield bits, codec.encode(np.repeat(points, 2, axis=0), bits).data
         yield bits, codec.encode(points // 4, bits).data
+    yield 5, codec.encode(np.argwhere(np.ones((6, 6, 6), bool)), 5).data  # dense: as pools
 
 
 def damage(data, rng):

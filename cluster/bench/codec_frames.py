@@ -13,7 +13,7 @@ from ...nodes.raster import PointSize, ResidentPoints
 from ...nodes.raster.cpu import CpuRasterizer
 from ...nodes.raster.framebuffers import FramebufferRasterizer
 from ...nodes.raster.group_raster import CpuGroupRasterizer, ResidentGroups
-from ...nodes.raster.groups import group_cell, group_cells
+from ...nodes.raster.groups import GroupCell, group_cell, group_cells
 from ...nodes.raster.pools import PoolCell, draw_pools, pool_cells
 from ...shared.camera import Camera
 from ...shared.codecs import linear_groups, streams
@@ -30,7 +30,13 @@ def points_frame(
     cells: Sequence[Cell], positions: Sequence[np.ndarray], orders: Sequence[np.ndarray], camera: Camera, compact: bool
 ) -> Iterator[Draw]:
     """From float32, or from fixed point: positions of each cell, relative to its cube, and which points they are."""
-    points = resident(cells, positions, orders)
+    with resident_frame(resident(cells, positions, orders), camera, compact) as draw:
+        yield draw
+
+
+@contextmanager
+def resident_frame(points: ResidentPoints, camera: Camera, compact: bool) -> Iterator[Draw]:
+    """From float32, or from fixed point."""
     everything = np.array([(0, len(points), 1)], RENDER_POINT)
     with CpuRasterizer(points, camera.width, camera.height, compact=compact) as rasterizer:
         yield lambda: rasterizer.draw(camera, everything)
@@ -49,12 +55,21 @@ def pools_frame(
     cells: Sequence[Cell], data: Sequence[np.ndarray], orders: Sequence[np.ndarray], camera: Camera, bits: int
 ) -> Iterator[Draw]:
     """From the bytes of ``codecs.streams``."""
-    held = []
-    for cell, coded, order in zip(cells, data, orders, strict=True):
-        palette, colour = to_palette(cell.colour[order])
-        pooled = streams.read_pools(coded, bits, len(order))
-        held.append(PoolCell(pooled, cell.lower, cell.edge / 2**bits, palette, colour))
-    with _CellRasterizer(draw_pools, pool_cells(held), len(cells), sum(map(len, orders)), camera) as rasterizer:
+    with cell_pools_frame(list(map(partial(cell_of_pools, bits), cells, data, orders)), camera) as draw:
+        yield draw
+
+
+def cell_of_pools(bits: int, cell: Cell, data: np.ndarray, order: np.ndarray) -> PoolCell:
+    """A cell's bytes of ``codecs.streams``, in the form they are drawn from."""
+    palette, colour = to_palette(cell.colour[order])
+    return PoolCell(streams.read_pools(data, bits, len(order)), cell.lower, cell.edge / 2**bits, palette, colour)
+
+
+@contextmanager
+def cell_pools_frame(cells: Sequence[PoolCell], camera: Camera) -> Iterator[Draw]:
+    """From cells of pools."""
+    n_points = sum(len(cell.colour) for cell in cells)
+    with _CellRasterizer(draw_pools, pool_cells(cells), len(cells), n_points, camera) as rasterizer:
         yield rasterizer.draw
 
 
@@ -63,11 +78,20 @@ def groups_frame(
     cells: Sequence[Cell], data: Sequence[np.ndarray], orders: Sequence[np.ndarray], camera: Camera, bits: int
 ) -> Iterator[Draw]:
     """From the bytes of ``codecs.linear_groups``."""
-    held = [
-        group_cell(linear_groups.read(coded, bits, len(order)), cell.lower, cell.edge / 2**bits, cell.colour[order])
-        for cell, coded, order in zip(cells, data, orders, strict=True)
-    ]
-    points = ResidentGroups(group_cells(held), np.cumsum([0, *map(len, orders)], dtype=np.int64))
+    with cell_groups_frame(list(map(partial(cell_of_groups, bits), cells, data, orders)), camera) as draw:
+        yield draw
+
+
+def cell_of_groups(bits: int, cell: Cell, data: np.ndarray, order: np.ndarray) -> GroupCell:
+    """A cell's bytes of ``codecs.linear_groups``, in the form they are drawn from."""
+    return group_cell(linear_groups.read(data, bits, len(order)), cell.lower, cell.edge / 2**bits, cell.colour[order])
+
+
+@contextmanager
+def cell_groups_frame(cells: Sequence[GroupCell], camera: Camera) -> Iterator[Draw]:
+    """From cells of linear groups."""
+    n_points = [len(cell.kept_colour) + len(cell.inner_colour) for cell in cells]
+    points = ResidentGroups(group_cells(cells), np.cumsum([0, *n_points], dtype=np.int64))
     everything = np.array([(0, len(points), 1)], RENDER_POINT)
     with CpuGroupRasterizer(points, camera.width, camera.height) as rasterizer:
         yield lambda: rasterizer.draw(camera, everything)
