@@ -63,8 +63,8 @@ def pool_positions(
 
     columns : x, y, z of a range of the points as they will be read from the scene.
     progress : called with the points done, and in all.
-    Cost: 2 to 4 µs a point and core, more where points are few for the grid. Memory: cells at the same time on as many threads as
-    ``settings.memory_bytes`` has room for, one at least.
+    Cost: 2 to 4 µs a point and core, more where points are few for the grid. Memory: cells at the same time on as many
+    threads as ``settings.memory_bytes`` has room for, one at least.
     """
     level, first, count = cells["cell_level"], cells["cell_first_point"], cells["cell_n_points"]
     pool_points, pool_bytes = np.zeros(len(level), np.uint32), np.zeros(len(level), np.uint32)
