@@ -1,8 +1,8 @@
 """CityJSON 1 and 2: the ground outline of each building, and how far up it goes.
 
 The outline is that of the surfaces named GroundSurface; where none is named, of those at the bottom that face down;
-where there are hardly any, of those that face up, the roofs. What two of them share is no outline; where they overlap
-is taken for a hole.
+where there are hardly any, of those that face up, the roofs. An edge that two of them share is no outline. Where they
+overlap, each is a prism of its own.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import InputError
+from ..outlines import fans
 from .footprints import Footprint, Footprints
 from .json_file import LARGEST, expect_list, numbers, wrong
 
@@ -23,6 +24,7 @@ BUILDINGS = ("Building", "BuildingPart")
 _DEPTH = {"MultiSurface": 0, "CompositeSurface": 0, "Solid": 1, "MultiSolid": 2, "CompositeSolid": 2}
 _BOTTOM = 0.1  # of an object's height: surfaces below may be its ground
 _ENOUGH = 0.5  # of the area of its roofs
+_OVERLAP = 1e-3  # of the area of surfaces: below they are taken for neighbours
 
 
 def read_cityjson(path: Path, content: dict[str, Any], types: Sequence[str] = BUILDINGS) -> Footprints:
@@ -95,8 +97,8 @@ def _footprint(path: Path, where: str, city_object: dict[str, Any], vertices: np
     properties = city_object.get("attributes", {})
     if not isinstance(properties, dict):
         raise wrong(path, f"{where}.attributes", properties, "an object")
-    rings = [ring[:, :2] for rings in _ground(surfaces, names, z) for ring in rings]
-    return Footprint(where, [rings], properties, float(z.min()), float(z.max()))
+    ground = [[ring[:, :2] for ring in rings] for rings in _ground(surfaces, names, z)]
+    return Footprint(where, _without_seams(ground), properties, float(z.min()), float(z.max()))
 
 
 def _level(lod: Any) -> float:
@@ -159,6 +161,21 @@ def _ground(surfaces: list[list[np.ndarray]], names: list[str | None], z: np.nda
     lowest = (area < 0) & (top <= z.min() + _BOTTOM * (z.max() - z.min()))
     is_ground = lowest if -area[lowest].sum() > _ENOUGH * area[area > 0].sum() else area > 0
     return [surface for surface, chosen in zip(surfaces, is_ground, strict=True) if chosen]
+
+
+def _without_seams(surfaces: list[list[np.ndarray]]) -> list[list[np.ndarray]]:
+    """Polygons with the inside of the surfaces: one, in which edges of two surfaces vanish, unless they overlap."""
+    rings = [ring for surface in surfaces for ring in surface]
+    if len(surfaces) < 2:
+        return [rings]
+    every = np.concatenate(rings)
+    middle, half = (every.min(axis=0) + every.max(axis=0)) / 2, max(np.ptp(every, axis=0).max() / 2, 1e-30)
+    scale = (1 << 20) / half
+    point, apex, *_ = fans([np.rint((ring - middle) * scale).astype(np.int64) for ring in rings])
+    start, end = (point - apex)[:-1], (point[1:] - apex[:-1])
+    area = (start[:, 0] * end[:, 1] - start[:, 1] * end[:, 0]).sum() / 2 / scale**2
+    expected = sum(2 * abs(_area(surface[0])) - sum(abs(_area(ring)) for ring in surface) for surface in surfaces)
+    return [rings] if area > (1 - _OVERLAP) * expected else surfaces
 
 
 def _area(ring: np.ndarray) -> float:

@@ -10,8 +10,8 @@ import numpy as np
 
 from ...errors import InputError
 
-MAX_BYTES = 1 << 29
-"""Of a file: its content takes ten to twenty times as much memory."""
+MAX_BYTES = 1 << 28
+"""Of a file: its content takes ten to thirty times as much memory."""
 
 LARGEST = 1e30
 """Of numbers: those above are taken for errors, as what is not finite."""
