@@ -20,8 +20,9 @@ from ...shared.codecs.pools import TAG_BITS
 from .gl_resident import RUN
 from .pools import PoolCells
 
-UNIT_VERTICES = 64
+UNIT_VERTICES = 256
 UNIT_LOOSE = 4096
+"""Some thousand points either way, as the pieces of ``gl`` and for their reasons."""
 
 UNIT = np.dtype(
     [
@@ -167,16 +168,23 @@ def _records(cells: PoolCells) -> tuple[np.ndarray, np.ndarray]:
     """(w,) uint32 records, those of vertices before those of loose points; (v + 1,) int64: where each vertex's begins,
     and where they end.
 
-    A vertex: its place on the grid, the number of its first colour, its tag. A loose point: its place.
+    A vertex: its place on the grid, the number of its first colour, its tag. A loose point: its place. The vertices of
+    a pool stand by number of points, so that invocations side by side go through as many: drawing took a sixth longer
+    without.
     """
-    n_words = np.repeat(_tag_words(cells), np.diff(cells.first_vertex))
+    vertices = np.diff(cells.first_vertex)
+    n_words = np.repeat(_tag_words(cells), vertices)
     first, first_tag = _starts(_VERTEX_WORDS + n_words), _starts(n_words)
     covered = _starts(np.bitwise_count(cells.tags))[first_tag]  # points of the vertices before
-    at = first[:-1]
+    order = np.lexsort((-np.diff(covered), np.repeat(np.arange(len(vertices)), vertices)))
     records = np.empty(first[-1] + cells.loose.shape[1], np.uint32)
-    records[at] = _packed(cells.vertices)
-    records[at + 1] = covered[:-1]
-    records[np.repeat(at + _VERTEX_WORDS - first_tag[:-1], n_words) + np.arange(len(cells.tags))] = cells.tags
+    at, tag, words = first[:-1], first_tag[:-1], np.arange(len(cells.tags))
+    records[at] = _packed(cells.vertices[order])
+    records[at + 1] = covered[order]
+    # a pool's tags are of one length, so they stand where others of the same pool stood
+    records[np.repeat(at + _VERTEX_WORDS - tag, n_words) + words] = cells.tags[
+        np.repeat(tag[order] - tag, n_words) + words
+    ]
     records[first[-1] :] = _packed(cells.loose.T)
     return records, first
 
