@@ -334,6 +334,43 @@ def test_what_is_wrong_is_said_in_one_line(tmp_path, content, text):
     assert len(str(error.value)) < 400
 
 
+def places(content, here=()):
+    """The keys and indices that lead to each value."""
+    yield here
+    for key in content if isinstance(content, dict) else range(len(content)) if isinstance(content, list) else ():
+        yield from places(content[key], (*here, key))
+
+
+ODD = [None, True, -1, 1.5, 1e300, -1e29, 10**40, "", "12", [], {}, [[]], [1, 2], {"type": "Polygon"}, "MultiSolid"]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_whatever_is_changed_there_is_a_layer_or_one_line(tmp_path, seed):
+    rng = np.random.default_rng(seed)
+    semantics = {"surfaces": [{"type": "GroundSurface"}], "values": [[0, None, 0, None, None, None]]}
+    parts = {"type": "MultiPolygon", "coordinates": [[DEGREES]]}
+    originals = [
+        city(semantics=semantics),
+        city(kind="MultiSurface", attributes={"height": 3}),
+        collection(feature(polygon(SQUARE, moved(SQUARE, 300)), height=3), feature(parts, v=2)),
+    ]
+    made, said = 0, []
+    for _ in range(150):
+        content = {"": json.loads(json.dumps(originals[rng.integers(3)]))}
+        for _ in range(rng.integers(1, 4)):
+            *way, last = list(places(content))[1:][rng.integers(len(list(places(content))) - 1)]
+            holder = content
+            for key in way:
+                holder = holder[key]
+            holder[last] = ODD[rng.integers(len(ODD))]
+        try:
+            made += len(read(tmp_path, content[""]).layer) > 0
+        except InputError as error:
+            said.append(str(error))
+    assert 0 < made < 150
+    assert all(map(str.isprintable, said))
+
+
 def test_large_files_are_not_read(tmp_path, monkeypatch):
     monkeypatch.setattr(json_file, "MAX_BYTES", 100)
     with pytest.raises(InputError, match=r"found 1.. bytes, expected at most 100"):

@@ -84,7 +84,7 @@ def _footprint(path: Path, where: str, city_object: dict[str, Any], vertices: np
     for i, geometry in enumerate(city_object["geometry"]):
         if not isinstance(geometry, dict):
             raise wrong(path, f"{where}.geometry[{i}]", geometry, "an object")
-        if geometry.get("type") in _DEPTH:
+        if isinstance(kind := geometry.get("type"), str) and kind in _DEPTH:
             geometries.append((_level(geometry.get("lod")), i, geometry))
     if not geometries:
         return None
