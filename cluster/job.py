@@ -8,6 +8,8 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from ..nodes.culling import CullingNode
 from ..nodes.layer_sampling import LayerSamplingNode
 from ..nodes.picture.compose import Composer, Picture, PictureSettings
@@ -44,14 +46,19 @@ class Job:
     ``views.per_picture`` to a picture. Sizes of points are in drawn pixels, so that they do not depend on
     ``render.supersampling`` in the picture.
 
-    scene : the one to draw; default: that of ``scene.path``.
+    scene : the one to draw; default: that of ``scene.path``, or one without points where there are only layers.
     """
 
     def __init__(self, config: RunConfig, scene: Scene | None = None) -> None:
-        if scene is None and not config.scene.path:
+        if scene is None and not (config.scene.path or config.layers):
             raise ConfigError("scene.path: missing, expected a scene directory made by splatpipe build")
         self.config = config
-        self.scene = scene or Scene.open(Path(os.path.normpath(config.scene.path)))
+        self.layers = [open_layer(layer.path) for layer in config.layers]
+        if self.layers:
+            require_gl("layers are drawn with OpenGL")
+            if config.scene.delivery == "messages":
+                raise ConfigError("scene.delivery = 'messages': every rank opens the layers, expected 'files'")
+        self.scene = scene or self._open_scene()
         info = self.scene.info
         self.n_pictures = config.output.frames
         self.frames_in_flight = config.pipeline.frames_in_flight
@@ -83,9 +90,6 @@ class Job:
         check_style(render.rasterizer, self.splats, groups=self.coded)
         if self.coded and self.point_filter:
             raise ConfigError("render.positions = 'coded': found a filter, which takes points out of their groups")
-        self.layers = [open_layer(layer.path) for layer in config.layers]
-        if self.layers:
-            require_gl("layers are drawn with OpenGL")
         self.background = parse_colour(render.background, "render.background")
         self.colouring = Colouring.choose(
             self.scene, render.colour, render.colormap, render.colour_range, render.class_colours
@@ -163,6 +167,17 @@ class Job:
             whole_sets=self.coded,
             pools=self.pools,
             point_bytes=self.position_bytes + self.attribute_bytes,
+        )
+
+    def _open_scene(self) -> Scene:
+        if self.config.scene.path:
+            return Scene.open(Path(os.path.normpath(self.config.scene.path)))
+        from ..shared.empty_scene import EmptyScene
+
+        corners = [layer.bounds for layer in self.layers]
+        return EmptyScene(
+            np.min([lower.min(axis=0) for lower, _ in corners], axis=0),
+            np.max([upper.max(axis=0) for _, upper in corners], axis=0),
         )
 
     def layer_nodes(self) -> list[tuple[CullingNode, LayerSamplingNode]]:

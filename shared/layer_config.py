@@ -12,6 +12,13 @@ from pydantic import Field
 from .section import Section
 
 
+class ArcStyle(Section):
+    """``[layers.arcs]``."""
+
+    segments: Annotated[int, Field(ge=0, le=4096)] = 0
+    tolerance_px: Annotated[float, Field(gt=0, le=64)] = 0.25
+
+
 class BlockStyle(Section):
     """``[layers.blocks]``."""
 
@@ -27,4 +34,5 @@ class LayerSection(Section):
     colormap: str = "viridis"
     value_range: tuple[float, float] | None = None
     value_filter: tuple[float, float] | None = None
+    arcs: ArcStyle = ArcStyle()
     blocks: BlockStyle = BlockStyle()

@@ -20,6 +20,21 @@ def gl_layer(context: moderngl.Context, layer: Layer, settings: LayerSection) ->
     """The layer on the device. Raises ConfigError for a kind or technique that does not exist."""
     technique = settings.technique
     match layer.kind, technique:
+        case "arcs", "avc":
+            from .gl_arcs import GlArcs
+
+            return GlArcs(context, layer, settings)
+        case "arcs", "instancing":
+            from .gl_arcs import GlArcInstances
+
+            return GlArcInstances(context, layer, settings)
+        case "arcs", "triangles" | "strips":
+            from .expand_arcs import strips
+            from .gl_mesh import GlMesh
+            from .mesh import separate
+
+            mesh = strips(layer, settings.arcs.segments)
+            return GlMesh(context, layer, settings, separate(mesh) if technique == "triangles" else mesh)
         case "blocks", "avc":
             from .gl_blocks import GlBlocks
 

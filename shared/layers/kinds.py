@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from . import blocks, cuboids, polygons
+from . import arcs, blocks, cuboids, polygons
 from .layer import Layer
 
 
@@ -26,4 +26,4 @@ class Kind(Protocol):
         ...
 
 
-KINDS: Mapping[str, Kind] = {"blocks": blocks, "cuboids": cuboids, "polygons": polygons}  # type: ignore[dict-item]
+KINDS: Mapping[str, Kind] = {"arcs": arcs, "blocks": blocks, "cuboids": cuboids, "polygons": polygons}  # type: ignore[dict-item]
