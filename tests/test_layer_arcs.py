@@ -137,7 +137,7 @@ def test_tessellated_arcs_are_round_from_near_and_far(distance):
         with GlLayers([layer], [LayerSection(path="", arcs=ArcStyle(**style))], 320, 240) as canvas:
             return canvas.draw(camera, [np.array([(0, len(layer), 1)], RENDER_POINT)]) != FRAMEBUFFER_EMPTY
 
-    exact, fine, coarse = covered(segments=4096), covered(tolerance_px=0.25), covered(segments=4)
+    exact, fine, coarse = covered(segments=4096), covered(tolerance_px=0.02), covered(segments=4)
     assert exact.any()
     assert (fine != exact).sum() <= 0.02 * exact.sum() + 3
     if distance == 1.0:
