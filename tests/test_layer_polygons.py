@@ -13,7 +13,7 @@ from splatpipe.shared.errors import InputError
 from splatpipe.shared.layer_config import LayerSection
 from splatpipe.shared.layers.layer import check_layer
 from splatpipe.shared.layers.layer_store import open_layer, write_layer
-from splatpipe.shared.layers.outlines import DONE, TOO_MANY_CROSSINGS, fans
+from splatpipe.shared.layers.outlines import DONE, TOO_MANY_ABREAST, TOO_MANY_CROSSINGS, fans
 from splatpipe.shared.layers.polygons import polygon_layer
 from splatpipe.shared.messages import FRAMEBUFFER_EMPTY, RENDER_POINT
 
@@ -164,6 +164,14 @@ def test_outlines_with_more_crossings_than_room_are_refused_by_name():
     assert fans([ring])[3] == TOO_MANY_CROSSINGS
     with pytest.raises(InputError, match="layer x: outline of object 1, of 400 points: crosses itself too often"):
         polygon_layer("x", [[[np.array(SQUARE, float)]], [[ring.astype(float)]]], np.array([[0, 1.0]] * 2), np.zeros(2))
+
+
+def test_outlines_with_more_edges_abreast_than_there_is_time_for_are_refused():
+    x = np.tile([0, 1000], 50)
+    comb = np.column_stack([x, np.arange(100)])
+    ring = np.concatenate([comb, [[2000, 100], [2000, -1]]])
+    assert fans([ring])[3] == DONE
+    assert fans([ring], most_pairs=4000)[3] == TOO_MANY_ABREAST
 
 
 def layer_of(shapes, origin=(0.0, 0.0), **kwargs):

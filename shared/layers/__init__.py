@@ -8,6 +8,7 @@ module                  content
 ``layer_store``         a layer on disk
 ``kinds``               the kinds by name
 ``cuboids`` …           the record of each kind, what it may hold, and where its objects lie
+``outlines``            outlines of any sort → fans, of which polygons consist
 ======================  ==================================================================================
 
 Layers lie in world axes, heights along +z. Positions are float32 relative to the layer's origin, which is float64: they

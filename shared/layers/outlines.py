@@ -31,15 +31,18 @@ _HALF = 1 << COORDINATE_BITS
 _MASK = (1 << _SHIFT) - 1
 _ROUNDS = 64
 _STAR = 64  # edges of the largest piece of which it is tried whether a vertex sees all of it
-DONE, TOO_MANY_CROSSINGS, NOT_SETTLED = 0, 1, 2
+DONE, TOO_MANY_CROSSINGS, TOO_MANY_ABREAST, NOT_SETTLED = 0, 1, 2, 3
+MOST_PAIRS = 1 << 33
+"""Of edges with a common x that are looked at for where they meet: some ten seconds."""
 
 
-def fans(rings: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+def fans(rings: list[np.ndarray], most_pairs: int = MOST_PAIRS) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
     """The fans of (k, 2) int64 rings within ±2**24, closed by themselves, whether they repeat their first point or not.
 
     Returns (m, 2) int64 points; (m, 2) int64 apex of each; (m,) bool: the edge from this point to the next is one of
-    the outline; and DONE, or why there is nothing: TOO_MANY_CROSSINGS, NOT_SETTLED. A fan is a run of points with
-    one apex, the first and last of which are the apex itself. Fans go counterclockwise. Nothing inside: m = 0.
+    the outline; and DONE, or why there is nothing: TOO_MANY_CROSSINGS, TOO_MANY_ABREAST, NOT_SETTLED. A fan is a run
+    of points with one apex, the first and last of which are the apex itself. Fans go counterclockwise. Nothing
+    inside: m = 0.
 
     Cost: O((n + crossings) · edges abreast) for n edges, in a few passes.
     """
@@ -50,7 +53,7 @@ def fans(rings: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray, i
     keys = [(ring[:, 0] + _HALF << _SHIFT) | ring[:, 1] + _HALF for ring in rings]
     start = np.concatenate(keys)
     end = np.concatenate([np.roll(k, -1) for k in keys])
-    point, apex, side, status = _fans(start, end)
+    point, apex, side, status = _fans(start, end, most_pairs)
     return _unpacked(point), _unpacked(apex), side, status
 
 
@@ -59,9 +62,9 @@ def _unpacked(key: np.ndarray) -> np.ndarray:
 
 
 @njit(nogil=True, cache=True)
-def _fans(start, end):
+def _fans(start, end, most_pairs):
     none = np.empty(0, np.int64)
-    low, high, status = _planar(start, end)
+    low, high, status = _planar(start, end, most_pairs)
     if status != DONE or not len(low):
         return none, none, np.empty(0, np.bool_), status
     points = np.unique(np.concatenate((low, high)))
@@ -94,11 +97,13 @@ def _odd(start, end):
 
 
 @njit(nogil=True, cache=True)
-def _planar(start, end):
+def _planar(start, end, most_pairs):
     """Edges (as ``_odd``) with the same inside that meet at their ends only."""
     low, high = _odd(start, end)
     most = 8 * len(start) + 1024
     for _ in range(_ROUNDS):
+        if _pairs(low >> _SHIFT, high >> _SHIFT) > most_pairs:
+            return low, high, TOO_MANY_ABREAST
         edge, at = _meetings(low, high, most)
         if len(edge) > most:
             return low, high, TOO_MANY_CROSSINGS
@@ -106,6 +111,12 @@ def _planar(start, end):
             return low, high, DONE
         low, high = _cut(low, high, edge, at)
     return low, high, NOT_SETTLED
+
+
+@njit(nogil=True, cache=True)
+def _pairs(low_x, high_x):
+    """How many pairs of edges have a common x. Edges sorted by ``low_x``."""
+    return (np.searchsorted(low_x, high_x, side="right") - np.arange(len(low_x)) - 1).sum()
 
 
 @njit(nogil=True, cache=True)

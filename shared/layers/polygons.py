@@ -35,10 +35,16 @@ import numpy as np
 
 from ..errors import InputError
 from .layer import Layer, check_layer
-from .outlines import COORDINATE_BITS, DONE, TOO_MANY_CROSSINGS, fans
+from .outlines import COORDINATE_BITS, DONE, NOT_SETTLED, TOO_MANY_ABREAST, TOO_MANY_CROSSINGS, fans
 
 OBJECT = np.dtype([("height", "<f4", 2), ("value", "<f4")])
 ELEMENT = np.dtype([("position", "<f4", 2), ("apex", "<f4", 2), ("side", "u1")])
+
+_WHY = {
+    TOO_MANY_CROSSINGS: "crosses itself too often",
+    TOO_MANY_ABREAST: "too many long edges side by side",
+    NOT_SETTLED: "does not come apart at its crossings",
+}
 
 Polygon = Sequence[np.ndarray]
 """Rings, (k, 2) float64 each, world: what lies in an odd number of them. They may repeat their first point or not."""
@@ -126,8 +132,7 @@ def _elements(name: str, i: int, polygon: Polygon, origin: np.ndarray, unit: flo
     rings = [np.rint((ring - origin) / unit).astype(np.int64) for ring in polygon]
     point, apex, side, status = fans(rings)
     if status != DONE:
-        why = "crosses itself too often" if status == TOO_MANY_CROSSINGS else "does not come apart at its crossings"
-        raise InputError(f"layer {name}: outline of object {i}, of {sum(map(len, rings))} points: {why}")
+        raise InputError(f"layer {name}: outline of object {i}, of {sum(map(len, rings))} points: {_WHY[status]}")
     elements = np.empty(len(point), ELEMENT)
     elements["position"], elements["apex"], elements["side"] = point * unit, apex * unit, side
     return elements
