@@ -245,10 +245,11 @@ def _draw_run(groups, run, rows, side_at_one, view, words, dirty, scratch):
             n, any_code = 0, np.uint32(0)
         any_code |= code[a] | code[b]
         dx, dy, dw = kept_x[b] - kept_x[a], kept_y[b] - kept_y[a], kept_w[b] - kept_w[a]
+        ax, ay, aw = kept_x[a], kept_y[a], kept_w[a]
         for i in range(m):
             t = np.float32(groups.parameter[np.uintp(q) + np.uintp(i)]) * _STEP
             k = np.uintp(n) + np.uintp(i)
-            x[k], y[k], w[k] = kept_x[a] + t * dx, kept_y[a] + t * dy, kept_w[a] + t * dw
+            x[k], y[k], w[k] = ax + t * dx, ay + t * dy, aw + t * dw
         if gaps:
             for i in range(m):
                 colour[n + i] = groups.inner_colour[q + i]
