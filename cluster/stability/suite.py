@@ -20,6 +20,7 @@ MODULES = (
     "splatpipe.nodes.stability.clouds",
     "splatpipe.nodes.stability.compact",
     "splatpipe.nodes.stability.groups",
+    "splatpipe.nodes.stability.pools",
     "splatpipe.nodes.stability.viewports",
     "splatpipe.nodes.stability.splats",
     "splatpipe.nodes.stability.opengl",

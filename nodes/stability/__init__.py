@@ -10,6 +10,8 @@ module          owns
 ``clouds``      degenerate clouds: coincident, collinear, one hot octant, …
 ``compact``     positions in fixed point
 ``groups``      positions interpolated in linear groups
+``pools``       positions that are sums of a vertex and a translation
+``matrices``    what both are drawn with: matrices that stretch or flatten
 ``viewports``   pixel borders and the smallest and largest images
 ``splats``      degenerate and grazing splats, any ε, the smallest and largest images
 ``large``       more points than 32 bits count

@@ -1,15 +1,20 @@
-"""Frames drawn from linear groups: cells of any size and place, eyes among the points, near planes at the eye."""
+"""Frames drawn from linear groups: cells of any size and place, eyes among the points, matrices that flatten."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from ...shared.camera import look_at, perspective_camera
+from ...shared.camera import Camera, look_at, perspective_camera
 from ...shared.codecs.linear_groups import LinearGroupCodec
+from ...shared.messages import FRAMEBUFFER_EMPTY
 from ...shared.stability.case import cases, expect
 from ..raster import ResidentPoints
-from ..raster.groups import group_cell, group_cells
+from ..raster.group_raster import CpuGroupRasterizer, ResidentGroups
+from ..raster.groups import GroupCells, group_cell, group_cells
 from ..raster.groups_reference import project_groups
+from ..raster.reference import reference_frame
+from .chain import every_point
+from .matrices import MATRICES, SEEN, through
 
 _VIEWS = {
     "cell of 1e-9": (1e-9, 0.0, (0.5, -2.0, 1.5)),
@@ -27,20 +32,50 @@ def image_position(name: str) -> float:
     against float64; 1920×1080.
     """
     edge, shift, eye = _VIEWS[name]
-    u, v = np.random.default_rng(73).uniform(0, 1, (2, 4000))
-    sheet = np.column_stack([u, v, 0.5 + 0.01 * np.sin(5 * u) * np.cos(4 * v)])
-    cell, _ = LinearGroupCodec(100.0).group((sheet * 2**16).astype(np.int64), 16)
-    expect(len(cell.parameter) > 1000, "many points are grouped")
-    none = np.zeros(len(cell), np.uint32)
-    groups = group_cells([group_cell(cell, np.full(3, shift), edge / 2**16, none)])
-    pose = look_at(np.array(eye) * edge + shift, np.array([0.5, 0.5, 0.5]) * edge + shift, np.array([0.0, 0.0, 1.0]))
-    camera = perspective_camera(
-        frame=0, world_from_camera=pose, fov_y_rad=0.9, width=1920, height=1080, near=0.01 * edge
-    )
-    points = ResidentPoints(none, none, none, none, np.zeros(1, np.int64), np.zeros((1, 3)))
-    index = np.arange(len(cell))
+    groups, camera = _sheet(edge, shift), _camera(edge, shift, eye)
+    points = _without_positions(groups)
+    index = np.arange(len(points))
     exact_u, exact_v, w = project_groups(groups)(points, camera, index)
     u, v, _ = project_groups(groups, np.float32)(points, camera, index)
     seen = (w >= camera.near) & (exact_u >= 0) & (exact_u < 1920) & (exact_v >= 0) & (exact_v < 1080)
     expect(seen.sum() > 500, "points are in the image")
     return float(np.hypot(u - exact_u, v - exact_v)[seen].max())
+
+
+@cases("linear groups/drawn matrix", bounds=dict.fromkeys(MATRICES, 0.0), unit="pixels")
+def drawn_matrix(name: str) -> float:
+    """Pixels of a frame from linear groups that differ from the NumPy twin's, the camera's matrix stretched, flattened,
+    without depth, or too large for float32.
+    """
+    groups, camera = _sheet(1.0, 0.0), through(_camera(1.0, 0.0, (0.5, -2.0, 1.5)), name)
+    points = _without_positions(groups)
+    held = ResidentGroups(groups, np.array([0, len(points)]))
+    with CpuGroupRasterizer(held, camera.width, camera.height, threads=1) as rasterizer:
+        found = rasterizer.draw(camera, every_point(points))
+        with np.errstate(all="ignore"):
+            expected = reference_frame(
+                points, camera, every_point(points), projection=project_groups(groups, np.float32)
+            )
+        expect((expected != FRAMEBUFFER_EMPTY).any() == (name in SEEN), "points are in the image, or none can be")
+        return int((found != expected).sum())
+
+
+def _sheet(edge: float, shift: float) -> GroupCells:
+    """A wavy sheet in a cell of this edge, its lower corner at ``shift`` on each axis."""
+    u, v = np.random.default_rng(73).uniform(0, 1, (2, 4000))
+    sheet = np.column_stack([u, v, 0.5 + 0.01 * np.sin(5 * u) * np.cos(4 * v)])
+    cell, _ = LinearGroupCodec(100.0).group((sheet * 2**16).astype(np.int64), 16)
+    expect(len(cell.parameter) > 1000, "many points are grouped")
+    return group_cells([group_cell(cell, np.full(3, shift), edge / 2**16, np.zeros(len(cell), np.uint32))])
+
+
+def _without_positions(groups: GroupCells) -> ResidentPoints:
+    """What stands for the points where their projection says where they are; all of one colour."""
+    none = np.zeros(len(groups.x) + len(groups.parameter), np.uint32)
+    return ResidentPoints(none, none, none, none, np.zeros(1, np.int64), np.zeros((1, 3)))
+
+
+def _camera(edge: float, shift: float, eye: tuple[float, float, float]) -> Camera:
+    up, target = np.array([0.0, 0.0, 1.0]), np.full(3, 0.5)
+    pose = look_at(np.array(eye) * edge + shift, target * edge + shift, up)
+    return perspective_camera(frame=0, world_from_camera=pose, fov_y_rad=0.9, width=1920, height=1080, near=0.01 * edge)
