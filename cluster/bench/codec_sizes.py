@@ -137,8 +137,11 @@ def _measure(
     places = edge * np.column_stack([np.arange(n_cells) % side, np.arange(n_cells) // side, np.zeros(n_cells)])
     camera = _camera(edge * (side + 0.5), edge * side, size)
     counts = [len(form.cell.points) for form in chosen]
+    x, y, z = (np.concatenate([form.columns[axis] for form in chosen]) for axis in range(3))
     points = ResidentPoints(
-        *(np.concatenate([form.columns[axis] for form in chosen]) for axis in range(3)),
+        x,
+        y,
+        z,
         np.concatenate([form.cell.colour for form in chosen]),
         np.cumsum([0, *counts[:-1]], dtype=np.int64),
         places,

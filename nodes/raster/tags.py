@@ -125,7 +125,8 @@ def expand_tag_by_bytes(bits, x, y, w, dx, dy, dw, at, xs, ys, ws, n):
 
 def has_avx2() -> bool:
     """Whether numba compiles for a processor that has it."""
-    return "+avx2" in cpu_target.target_context.codegen().magic_tuple()[2].split(",")
+    context: Any = cpu_target.target_context
+    return "+avx2" in context.codegen().magic_tuple()[2].split(",")
 
 
 expand_tag: Any = expand_tag_by_bytes if has_avx2() else expand_tag_plain
