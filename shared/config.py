@@ -207,6 +207,12 @@ def parse_config(data: dict[str, Any], source: str = "configuration") -> RunConf
     return validated(RunConfig, data, source)
 
 
+def refuse_layers(config: RunConfig, why: str) -> None:
+    """Raise ConfigError, saying why, where a run has layers; for what knows points alone."""
+    if config.layers:
+        raise ConfigError(f"layers: found {len(config.layers)}, expected none: {why}")
+
+
 def validated(model: type[AnySection], data: dict[str, Any], source: str) -> AnySection:
     """Nested tables as ``model``; ConfigError names the key, what was found and what was expected."""
     _refuse_unknown(data, model, source, "")

@@ -360,6 +360,15 @@ def test_a_setting_of_a_scene_or_a_sweep_leaves_the_rest_of_its_section_alone(co
     assert {c.sampling.pixel_threshold for c in jpeg} == {0}
 
 
+def test_layers_are_refused(tmp_path):
+    (tmp_path / "e.toml").write_text(
+        '[[scene]]\nname = "a"\npath = "b"\n[[sweep]]\nmethod = "m"\nkey = "sampling.pixel_threshold"\nvalues = [1]\n'
+        '[[run.layers]]\npath = "c.layer"\n'
+    )
+    with pytest.raises(ConfigError, match=r"layers: found 1, expected none: .*e\.toml.* measures errors of points"):
+        load_error_config(tmp_path / "e.toml")
+
+
 def test_a_missing_file_and_a_file_without_a_sweep_are_refused(tmp_path):
     with pytest.raises(ConfigError, match="cannot be read"):
         load_error_config(tmp_path / "none.toml")

@@ -24,7 +24,7 @@ from splatpipe.nodes.raster.gl_probe import SIZES_BYTES, flop_per_s, transfer_ti
 from splatpipe.nodes.raster.reference import covered_pixels, point_indices, squares
 from splatpipe.shared.build import BuildSettings, build_scene
 from splatpipe.shared.camera import look_at, perspective_camera
-from splatpipe.shared.errors import InputError
+from splatpipe.shared.errors import ConfigError, InputError
 from splatpipe.shared.messages import RENDER_POINT
 from splatpipe.shared.synth import CityScan
 
@@ -232,6 +232,12 @@ def test_a_link_without_bandwidth_is_reported_as_never_in_time(tmp_path):
     assert [(c["verdict"], c["needed_s"], c["largest_frames_per_s"]) for c in sending] == [("violated", "inf", 0)] * 2
     text = make_report(model, "test").write(tmp_path / "stuck")[1].read_text()
     assert "at most 0 frames/s" in text
+
+
+def test_a_run_with_layers_is_refused(tmp_path):
+    (tmp_path / "run.toml").write_text('[scene]\npath = "a"\n[[layers]]\npath = "c.layer"\n')
+    with pytest.raises(ConfigError, match="layers: found 1, expected none: the model counts points alone"):
+        make_model(tmp_path / "run.toml", [], None, None, None)
 
 
 def test_the_report_gives_every_parameter_its_unit_and_source():

@@ -447,6 +447,12 @@ def test_the_fastest_repeats_are_not_disturbed(config, tmp_path):
     assert errors[True] < 0.02 < errors[False]
 
 
+def test_a_run_with_layers_is_refused():
+    run = parse_config({"layers": [{"path": "a.layer"}, {"path": "b.layer"}]})
+    with pytest.raises(ConfigError, match="layers: found 2, expected none: predictions count points alone"):
+        calibration_points(run)
+
+
 def test_a_rasterizer_without_a_model_is_refused(config, tmp_path):
     with pytest.raises(InputError, match=r"render\.rasterizer = 'gl', expected cpu"):
         predict_command(config, ["render.rasterizer=gl"], [], 8, 1, tmp_path, runner=fake_run)

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from ...shared.config import PositiveInt, RunConfig, read_toml, validated
+from ...shared.config import PositiveInt, RunConfig, read_toml, refuse_layers, validated
 from ...shared.errors import ConfigError
 from ...shared.section import Section
 
@@ -113,7 +113,9 @@ def load_error_config(path: Path) -> ErrorConfig:
 
 def base_config(config: ErrorConfig, scene: SceneEntry, source: str) -> PointConfig:
     """The run that the reference of a scene is drawn for."""
-    return _changed(config.run, {"scene.path": scene.path, **_flat(scene.set)}, f"{source}: scene {scene.name!r}")
+    run = _changed(config.run, {"scene.path": scene.path, **_flat(scene.set)}, f"{source}: scene {scene.name!r}")
+    refuse_layers(run, f"{source} measures errors of points")
+    return run
 
 
 def sweep_points(config: ErrorConfig, scene: SceneEntry, source: str) -> Iterator[SweepPoint]:

@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from ...shared.config import load_config
+from ...shared.config import load_config, refuse_layers
 from ...shared.errors import InputError
 from ...shared.views import VIEWS_PER_PICTURE
 from ..launch import inside_mpi
@@ -59,6 +59,7 @@ def make_model(
     samples: dict[str, Any] = {}
     if config is not None:
         settings = load_config(config, overrides)
+        refuse_layers(settings, "the model counts points alone")
         wanted = frames_per_s or settings.output.fps * VIEWS_PER_PICTURE[settings.camera.view]
         run, samples, system, application = _measure(config, overrides, filed, system_path, wanted)
     elif filed is None:

@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ...shared.config import RunConfig, load_config, parse_config
+from ...shared.config import RunConfig, load_config, parse_config, refuse_layers
 from ..experiment.config import ExperimentConfig, ExperimentSection
 from ..experiment.grid import Experiment, Point
 from ..experiment.journal import Journal
@@ -19,7 +19,7 @@ from ..job import Job
 from ..launch import mpi_available
 from .costs import Costs, Measured, fit_costs
 from .forecast import Machine, fit_messages
-from .workload import Workload, count_workload
+from .workload import NO_LAYERS, Workload, count_workload
 
 THRESHOLDS_PX = (4.0, 16.0)
 """Of the calibration of a run that draws every point (threshold 0); of others half and double theirs."""
@@ -29,7 +29,9 @@ def calibration_points(run: RunConfig) -> list[Point]:
     """The settings to measure for the costs of a run.
 
     On one rank two thresholds and half the resolution; both thresholds with all cores; three ranks where there is MPI.
+    Raises ConfigError for a run with layers.
     """
+    refuse_layers(run, NO_LAYERS)
     threshold = run.sampling.pixel_threshold
     fine, coarse = (threshold / 2, threshold * 2) if threshold else THRESHOLDS_PX
     size = (run.camera.width, run.camera.height)
@@ -64,12 +66,12 @@ def with_point(run: RunConfig, point: Point) -> RunConfig:
 def calibration_experiment(base: Path, overrides: list[str], output: Path, repeats: int) -> Experiment:
     """The calibration of one run configuration as an experiment of its own."""
     run = load_config(base, overrides)
-    whole: dict[str, Any] = run.model_dump(mode="json", exclude_none=True)
+    points = calibration_points(run)
+    whole: dict[str, Any] = run.model_dump(mode="json", exclude={"layers"}, exclude_none=True)
     common = {f"{section}.{key}": value for section, table in whole.items() for key, value in table.items()}
     for key in ("output.directory", "output.png", "output.mp4", "output.depth", "output.normals"):
         del common[key]
     common["scene.path"] = os.path.abspath(run.scene.path)
-    points = calibration_points(run)
     settings = ExperimentSection(base=str(base), output=str(output), repeats=repeats, title="Calibration")
     config = ExperimentConfig(experiment=settings, set=common)
     return Experiment(config, base, base, output, points, [with_point(run, point) for point in points])

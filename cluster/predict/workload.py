@@ -15,10 +15,13 @@ from ...nodes.cell_blocks import cell_blocks, cell_spacing
 from ...nodes.pooled_entries import PooledForms
 from ...nodes.sampling import POOLED_POINT_COST
 from ...shared.camera import Camera
+from ...shared.config import refuse_layers
 from ...shared.messages import HEADER, encode, points_of
 from ...shared.octree import Octree
 from ..job import Job
 from ..record import FrameCounts
+
+NO_LAYERS = "predictions count points alone"
 
 COLD_POINTS = 256
 """Points at the start of an entry that are read before the memory's prefetchers have caught up with it: the four
@@ -72,7 +75,11 @@ class Workload:
 
 
 def count_workload(job: Job) -> Workload:
-    """The workload of a job. Cost: culling and sampling of each frame, a few milliseconds."""
+    """The workload of a job. Raises ConfigError for one with layers.
+
+    Cost: culling and sampling of each frame, a few milliseconds.
+    """
+    refuse_layers(job.config, NO_LAYERS)
     octree = job.load_octree()
     forms = PooledForms.of(octree)
     culling, sampling = job.culling_node(octree), job.sampling_node(octree)
