@@ -46,32 +46,20 @@ def fans(rings: list[np.ndarray], most_pairs: int = MOST_PAIRS) -> tuple[np.ndar
 
     Cost: O((n + crossings) · edges abreast) for n edges, in a few passes.
     """
-    rings = [ring for ring in rings if len(ring) > 2]
-    if not rings:
-        empty = np.empty((0, 2), np.int64)
-        return empty, empty, np.empty(0, bool), DONE
+    rings = [ring for ring in rings if len(ring) > 2] or [np.zeros((1, 2), np.int64)]
     keys = [(ring[:, 0] + _HALF << _SHIFT) | ring[:, 1] + _HALF for ring in rings]
     start = np.concatenate(keys)
     end = np.concatenate([np.roll(k, -1) for k in keys])
-    point, apex, side, status = _fans(start, end, most_pairs)
-    return _unpacked(point), _unpacked(apex), side, status
-
-
-def _unpacked(key: np.ndarray) -> np.ndarray:
-    return np.column_stack([(key >> _SHIFT) - _HALF, (key & _MASK) - _HALF])
-
-
-@njit(nogil=True, cache=True)
-def _fans(start, end, most_pairs):
-    none = np.empty(0, np.int64)
     low, high, status = _planar(start, end, most_pairs)
     if status != DONE or not len(low):
-        return none, none, np.empty(0, np.bool_), status
+        empty = np.empty((0, 2), np.int64)
+        return empty, empty, np.empty(0, bool), status
     points = np.unique(np.concatenate((low, high)))
-    low, high = np.searchsorted(points, low), np.searchsorted(points, high)
-    corners = _triangles(points >> _SHIFT, points & _MASK, low, high)
-    point, apex, side = _joined(points >> _SHIFT, points & _MASK, corners)
-    return points[point], points[apex], side, status
+    x, y = points >> _SHIFT, points & _MASK
+    corners = _triangles(x, y, np.searchsorted(points, low), np.searchsorted(points, high))
+    point, apex, side = _joined(x, y, corners)
+    vertices = np.column_stack([x - _HALF, y - _HALF])
+    return vertices[point], vertices[apex], side, DONE
 
 
 @njit(nogil=True, cache=True)
