@@ -13,6 +13,8 @@ from build_sources import ArraySource, columns_for
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
+from splatpipe.cluster.error.config import load_error_config
+from splatpipe.cluster.error.scene import SweptScene
 from splatpipe.cluster.job import Job
 from splatpipe.cluster.launch import mpi_available
 from splatpipe.cluster.plan.ablation import same, trials
@@ -20,6 +22,7 @@ from splatpipe.cluster.plan.needs import parts
 from splatpipe.cluster.plan.part import ADAPTIVE, CHECKSUMS, COLOUR, SPLAT_LOOP, Part
 from splatpipe.cluster.plan.topology import Decision
 from splatpipe.cluster.plan.workload import Workload
+from splatpipe.cluster.progress import FrameProgress
 from splatpipe.nodes.culling import CullingNode
 from splatpipe.nodes.grouped_cells import load_groups
 from splatpipe.nodes.raster import PointSize, ResidentPoints
@@ -343,6 +346,33 @@ def test_plan_says_so_and_its_ablation_changes_no_bit(config):
     with trials(job) as found:
         assert {trial.part for trial in found} >= {COLOUR, SPLAT_LOOP, ADAPTIVE, CHECKSUMS}
         assert all(same(trial, job.camera(0)) for trial in found)
+
+
+def test_sweeps_draw_from_groups_but_round_nothing_more(scenes, tmp_path):
+    path = tmp_path / "error.toml"
+    text = (
+        '[run]\n[run.camera]\nwidth = 64\nheight = 48\n[run.render]\nrasterizer = "cpu"\ncolour = "rgb"\n'
+        f'[run.output]\nframes = 1\ndirectory = "{tmp_path}/out"\n'
+        f'[[scene]]\nname = "sheet"\npath = "{scenes["layered"].path}"\n'
+        '[[sweep]]\nmethod = "positions"\nkey = "render.positions"\nvalues = ["float32", "coded"]\n'
+    )
+    path.write_text(text)
+    config = load_error_config(path)
+    swept = SweptScene(config, config.scene[0], str(path))
+    with FrameProgress(None) as progress:
+        swept.prepare(progress)
+    found = []
+    for point in swept.points:
+        with swept.open(point) as pipeline:
+            found.append((pipeline.position_bytes, pipeline.draw(swept.cameras[0])[2].copy()))
+    assert found[0][0] == 12
+    assert 1 < found[1][0] < 8
+    covered = [frame != FRAMEBUFFER_EMPTY for _, frame in found]
+    assert covered[0].any()
+    assert (covered[0] != covered[1]).mean() < 0.02
+    path.write_text(text + "set = { positions.bits_per_axis = 9 }\n")
+    with pytest.raises(ConfigError, match=r"bits_per_axis = 9: found render.positions = 'coded', expected 0"):
+        load_error_config(path)
 
 
 def test_splats_are_refused(tmp_path, config):
