@@ -58,6 +58,7 @@ def run_single(job: Job, progress: Progress) -> dict[str, Any]:
             with clocks[RENDER].waiting():
                 render.show(frame, picture)
             counts.add(bits, chosen)
+            counts.add_layers(of_layers)
             progress("rendering", frame + 1)
         rendered_s = time.perf_counter() - started
     return {
@@ -194,6 +195,7 @@ def _render(job: Job, transport: Transport) -> None:
             with clock.waiting():
                 render.show(frame, picture)
             counts.add(chosen)
+            counts.add_layers(of_layers)
             transport.send_note(CULLING, Kind.FRAME_DONE, frame)
     statistics = _statistics(transport, clock, counts)
     statistics["per_frame"] |= render.times()

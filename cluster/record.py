@@ -7,7 +7,7 @@ import platform
 import resource
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -49,11 +49,11 @@ class StageClock:
 
 class FrameCounts:
     """How much of everything each frame had: cells that may be seen, render-points entries, points drawn;
-    of those, the pooled ones.
+    of those, the pooled ones; objects of layers.
     """
 
     def __init__(self) -> None:
-        self._lists: dict[str, list[int]] = {}
+        self._lists: dict[str, list[Any]] = {}
 
     def add(self, *messages: VisibilityBits | RenderPoints) -> None:
         """Count a frame's messages. Outside the stage clocks: it is no work of the pipeline."""
@@ -65,8 +65,13 @@ class FrameCounts:
             for name, count in found.items():
                 self._lists.setdefault(name, []).append(count)
 
-    def lists(self) -> dict[str, list[int]]:
-        """Name → one count a frame."""
+    def add_layers(self, of_layers: Sequence[RenderPoints]) -> None:
+        """Count the objects that a frame draws, a number for each layer; nothing where there is no layer."""
+        if of_layers:
+            self._lists.setdefault("objects", []).append([chosen.n_points for chosen in of_layers])
+
+    def lists(self) -> dict[str, list[Any]]:
+        """Name → one count a frame; ``objects``: one list a frame, a count for each layer."""
         return self._lists
 
 

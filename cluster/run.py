@@ -8,6 +8,7 @@ import os
 import time
 from dataclasses import asdict
 from pathlib import Path
+from statistics import mean
 from typing import Any
 
 from rich.console import Console
@@ -169,6 +170,7 @@ def _finish(
         "config_sha256": hashlib.sha256(job.config.model_dump_json().encode()).hexdigest(),
         "config": job.config.model_dump(mode="json"),
         "scene": {"points": job.scene.info.n_points, "cells": job.scene.info.n_cells},
+        "layers": [layer.told for layer in job.layers],
         "colour": job.colouring.mode,
         "frames": job.n_pictures,
         "views_per_picture": job.views.per_picture,
@@ -191,6 +193,9 @@ def _tell(summary: dict[str, Any]) -> None:
         f"{summary['frames']} frames, {summary['frames_per_s']:.1f} frames/s, {summary['topology']}, "
         f"{summary['rasterizer']}; median {stages}"
     )
+    for i, layer in enumerate(summary["layers"]):
+        drawn = mean(of_layers[i] for of_layers in summary["per_frame"]["objects"])
+        console.print(f"  layer {layer['name']}: {drawn:,.0f} of {layer['objects']:,} {layer['kind']} a frame")
     for path in summary["output"]:
         console.print(f"  wrote {path}")
     if summary["left_out"]:

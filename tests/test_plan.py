@@ -80,6 +80,7 @@ def test_a_bare_scene_leaves_out_what_it_has_no_use_for(config):
         "attributes intensity",
         "codecs",
         "flatness analysis",
+        named.LAYERS,
         named.OPENGL,
         named.COLOUR_MAPS,
         "second eye, panorama",

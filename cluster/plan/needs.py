@@ -18,6 +18,7 @@ from .part import (
     CLASSES,
     COLOUR,
     COLOUR_MAPS,
+    LAYERS,
     LEVEL_OF_DETAIL,
     MPI,
     NO_NORMALS,
@@ -56,6 +57,7 @@ def parts(job: Job, work: Workload, decision: Decision) -> list[Part]:
         _codec(job),
         _flatness(job),
         _checksums(job),
+        *_layers(job, work),
         _opengl(job),
         _colour_maps(job),
         *picture_parts(job, work),
@@ -256,13 +258,37 @@ def _checksums(job: Job) -> Part:
     return Part(CHECKSUMS, True, "scene.verify is false", cost_s, "s of loading")
 
 
+def _layers(job: Job, work: Workload) -> list[Part]:
+    """A part for each layer: what it has on the device, and what triangles would take there."""
+    if not job.layers:
+        return [Part(LAYERS, True, "no [[layers]]: no OpenGL and no shader for them", None, "MB resident", "counted")]
+    from ...nodes.layers.sizes import layer_bytes
+
+    found = []
+    for layer, settings, drawn in zip(job.layers, job.config.layers, work.objects, strict=True):
+        held, as_triangles = (layer_bytes(layer, settings, how) for how in (settings.technique, "triangles"))
+        why = f"{len(layer):,} {layer.kind}, {drawn:,.0f} a frame, as {settings.technique}: {_size(held)} resident"
+        if settings.technique != "triangles":
+            why += f", as triangles {_size(as_triangles)}"
+        found.append(Part(f"layer {layer.name}", False, why, 1e-6 * held, "MB resident", "counted"))
+    return found
+
+
+def _size(n_bytes: int) -> str:
+    return f"{1e-6 * n_bytes:,.1f} MB" if n_bytes >= 1e6 else f"{1e-3 * n_bytes:,.1f} kB"
+
+
 def _opengl(job: Job) -> Part:
     cpu = job.rasterizer == "cpu"
     why = "rasterizer cpu: no import, context or shader" if cpu else f"rasterizer {job.rasterizer}"
-    return Part(OPENGL, cpu, why, COSTS.opengl_s, "s of starting")
+    if job.layers:
+        why = f"layers are drawn with it; rasterizer {job.rasterizer}"
+    return Part(OPENGL, cpu and not job.layers, why, COSTS.opengl_s, "s of starting")
 
 
 def _colour_maps(job: Job) -> Part:
     mapped = job.colouring.mode in _COLOUR_MAPPED
     why = f"colour {job.colouring.mode} " + ("goes through one" if mapped else "needs none: matplotlib is not imported")
+    if not mapped and (by_value := [layer.name for layer in job.layers if layer.kind != "blocks"]):
+        mapped, why = True, f"values of layers go through them: {', '.join(by_value)}"
     return Part(COLOUR_MAPS, not mapped, why, COSTS.colour_maps_s, "s of starting")

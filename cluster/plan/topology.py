@@ -88,6 +88,8 @@ def choose_topology(job: Job, work: Workload, costs: UnitCosts = COSTS) -> Decis
     gain_s = found.single_s - found.pipelined_s
     selection_s = found.culling_s + found.sampling_s
     said = f"culling and sampling take {_ms(selection_s)} of an estimated {_ms(found.single_s)} a frame"
+    if job.layers:
+        said = f"without the layers {said}"
     if gain_s <= 0:
         saved_s = max(0.0, gain_s + found.message_s)
         return Decision(

@@ -36,6 +36,11 @@ class Layer:
     def __len__(self) -> int:
         return len(self.objects)
 
+    @property
+    def told(self) -> dict[str, Any]:
+        """What it is and how much there is of it, JSON-able."""
+        return {"name": self.name, "kind": self.kind, "objects": len(self), "elements": len(self.elements)}
+
     @cached_property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """((n, 3), (n, 3)) float64: lower and upper corner of each object's box, world frame."""
