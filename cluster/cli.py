@@ -147,10 +147,10 @@ def synth(
 
 @app.command()
 def info(
-    scene: Annotated[Path, typer.Argument(help="Scene directory, or a point file.")],
+    scene: Annotated[Path, typer.Argument(help="Scene or layer directory, or a point file.")],
     json: JsonOption = None,
 ) -> None:
-    """Say what a scene or a point file holds.
+    """Say what a scene, a layer or a point file holds.
 
     Example: `splatpipe info city.scene`
     """

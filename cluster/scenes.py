@@ -14,6 +14,7 @@ from rich.table import Table
 from ..shared.build import BuildReport, BuildSettings, build_scene
 from ..shared.errors import InputError
 from ..shared.files import write_json
+from ..shared.layers.layer_store import LAYER_FILE, open_layer
 from ..shared.octree import FEATURES
 from ..shared.pooled import PoolCounts
 from ..shared.readers import expand_inputs, open_source
@@ -71,8 +72,11 @@ def _tell_build(output: Path, report: BuildReport, seconds: float, positions: st
 
 
 def info_command(path: Path, json: Path | None) -> None:
-    """``splatpipe info``: of a scene directory or of a point file."""
-    content = _scene_info(path) if path.is_dir() else _file_info(path)
+    """``splatpipe info``: of a scene directory, a layer directory or a point file."""
+    if (path / LAYER_FILE).is_file():
+        content = _layer_info(path)
+    else:
+        content = _scene_info(path) if path.is_dir() else _file_info(path)
     table = Table(show_header=False, box=None)
     for key, value in content.items():
         table.add_row(key.replace("_", " "), _text(value))
@@ -109,6 +113,22 @@ def _scene_info(path: Path) -> dict[str, Any]:
     return {"scene": str(path), **info, "bytes": size}
 
 
+def _layer_info(path: Path) -> dict[str, Any]:
+    layer = open_layer(path)
+    lower, upper = layer.bounds
+    content = {"layer": str(path), **layer.told}
+    if "value" in (layer.objects.dtype.names or ()):
+        content["values"] = [float(end(layer.objects["value"])) for end in (np.min, np.max)]
+    return content | {
+        "origin": layer.origin.tolist(),
+        "lower": lower.min(axis=0).tolist(),
+        "upper": upper.max(axis=0).tolist(),
+        "cells": len(layer.octree),
+        "parameters": layer.parameters,
+        "bytes": sum(array.stat().st_size for array in path.glob("*.npy")),
+    }
+
+
 def _coded_info(scene: Scene) -> dict[str, float]:
     """What coded positions take, and how far they may lie from those of the input, an axis, world units."""
     octree, info = scene.octree(), scene.info
@@ -141,6 +161,8 @@ def _file_info(path: Path) -> dict[str, Any]:
 def _text(value: Any) -> str:
     if isinstance(value, int) and not isinstance(value, bool):
         return f"{value:,}"
+    if isinstance(value, dict):
+        value = ", ".join(f"{key} {_text(held)}" for key, held in value.items()) or "none"
     if isinstance(value, list | tuple):
         return ", ".join(_text(item) for item in value)
     text = "unknown" if value is None else str(value)

@@ -121,6 +121,26 @@ def test_a_run_of_layers_alone_has_a_plan(folder):
     assert "300 a frame" in found["layer random"].why
 
 
+def test_info_says_what_a_layer_holds(folder, tmp_path):
+    write_layer(some_polygons(), folder / "houses.layer", overwrite=True)
+    for name, said in (
+        ("houses", {"kind": "polygons", "objects": 3, "values": [0, 2], "lower": [0, 0, 0], "upper": [23, 23, 5]}),
+        ("blocks", {"kind": "blocks", "objects": 20, "elements": 0, "cells": 1}),
+    ):
+        done = program("info", folder / f"{name}.layer", "--json", tmp_path / "info.json")
+        assert done.returncode == 0, done.stderr
+        told = json.loads((tmp_path / "info.json").read_text())
+        assert {key: told[key] for key in said} == said
+        assert told["bytes"] == sum(path.stat().st_size for path in (folder / f"{name}.layer").glob("*.npy"))
+    assert told["parameters"] == {"block_size": 0.5, "colours": ["#aabbcc"]}
+    assert "values" not in told
+    assert "block_size 0.5, colours #aabbcc" in done.stdout
+    (folder / "blocks.layer" / "objects.npy").rename(folder / "objects.npy")
+    missing = program("info", folder / "blocks.layer")
+    (folder / "objects.npy").rename(folder / "blocks.layer" / "objects.npy")
+    assert (missing.returncode, len(missing.stderr.strip().splitlines())) == (2, 1)
+
+
 def program(*arguments):
     command = [sys.executable, "-m", "splatpipe.cluster", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
