@@ -82,7 +82,7 @@ def build(
     position_bits: Annotated[int, typer.Option(help="Coded: bits an axis of the grid in each cell; ci suits 6.")] = 12,
     group_epsilon: Annotated[
         float, typer.Option(help="groups: largest error, as a share of the scene's size.")
-    ] = 0.005,
+    ] = 0.001,
     group_detail: Annotated[
         float, typer.Option(help="groups: error at most this share of the extent of about 128 points; 0: off.")
     ] = 0.0,

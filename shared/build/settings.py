@@ -60,7 +60,7 @@ class BuildSettings:
     features: bool = False
     positions: str = "float32"
     position_bits: int = 12
-    group_epsilon: float = 0.005
+    group_epsilon: float = 0.001
     group_detail: float = 0.0
     pools: bool = False
     pool_bits: int = 0
