@@ -24,6 +24,7 @@ MODULES = (
     "splatpipe.nodes.stability.viewports",
     "splatpipe.nodes.stability.splats",
     "splatpipe.nodes.stability.opengl",
+    "splatpipe.nodes.stability.layers",
     "splatpipe.nodes.stability.large",
     "splatpipe.shared.stability.eigenvalues",
     "splatpipe.shared.stability.neighbourhoods",

@@ -14,6 +14,7 @@ module          owns
 ``matrices``    what both are drawn with: matrices that stretch or flatten
 ``viewports``   pixel borders and the smallest and largest images
 ``splats``      degenerate and grazing splats, any ε, the smallest and largest images
+``layers``      degenerate, crossing and far objects of layers
 ``large``       more points than 32 bits count
 ==============  ===============================================================
 """
