@@ -10,7 +10,7 @@ from ...shared.layers.layer import Layer
 from .mesh import Mesh
 
 CORNER = np.array([1, 5, 3, 7, 6, 5, 4, 1, 0, 3, 2, 6, 0, 4])
-"""(14,): vertices of a segment's strip as in ``arc.glsl``. Bit 0: the segment's end, 1: outer radius, 2: upper height."""
+"""(14,): vertices of a segment as in ``arc.glsl``; bit 0: the segment's end, 1: outer radius, 2: upper height."""
 
 RIGHT, BACK, TOP, FRONT, BOTTOM, LEFT = range(6)
 FACE = np.array([RIGHT] * 4 + [BACK] + [TOP] * 2 + [FRONT] * 2 + [BOTTOM] * 2 + [BACK] + [LEFT] * 2)
