@@ -1,4 +1,4 @@
-# Sourced by scripts/demo and scripts/test: makes .venv beside pyproject.toml with the package and some extras.
+# Sourced by scripts/demo, scripts/gallery and scripts/test: makes .venv beside pyproject.toml with the package and some extras.
 # Running it again costs nothing: a stamp remembers what was installed from which pyproject.toml.
 
 find_python() {
