@@ -25,6 +25,22 @@ class BlockStyle(Section):
     texture: Literal["grain", "plain"] = "grain"
 
 
+_Range = tuple[()] | tuple[float, float]
+
+
+class TrajectoryStyle(Section):
+    """``[layers.trajectories]``. Ranges of no numbers: none, or automatic."""
+
+    style: Literal["auto", "lines", "splats", "spheres", "tubes"] = "auto"
+    tube_px: Annotated[float, Field(ge=0, le=4096)] = 3.0
+    colour: Literal["speed", "acceleration", "time", "height"] = "speed"
+    radius: tuple[Annotated[float, Field(ge=0, le=2)], Annotated[float, Field(ge=0, le=2)]] = (0.5, 1.0)
+    acceleration_range: _Range = ()
+    selected: tuple[str | int, ...] = ()
+    highlight: _Range = ()
+    sides: Annotated[int, Field(ge=3, le=24)] = 8
+
+
 class LayerSection(Section):
     """One of ``[[layers]]``."""
 
@@ -36,3 +52,4 @@ class LayerSection(Section):
     value_filter: tuple[float, float] | None = None
     arcs: ArcStyle = ArcStyle()
     blocks: BlockStyle = BlockStyle()
+    trajectories: TrajectoryStyle = TrajectoryStyle()

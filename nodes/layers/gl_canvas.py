@@ -20,7 +20,7 @@ from ..raster.gl_context import check_errors, open_context
 
 if TYPE_CHECKING:
     from ...shared.layer_config import LayerSection
-    from .gl_layer import GlLayer
+    from .gl_layer import Drawn
 
 
 class GlLayers:
@@ -54,7 +54,7 @@ class GlLayers:
                 depth_attachment=depth
             )  # clearing integer colours is undefined
             self._context.enable_only(moderngl.DEPTH_TEST)
-            self._layers: list[GlLayer] = [
+            self._layers: list[Drawn] = [
                 gl_layer(self._context, layer, setting) for layer, setting in zip(layers, settings, strict=True)
             ]
             check_errors(self._context, "setting up layers")

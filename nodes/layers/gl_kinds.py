@@ -11,12 +11,12 @@ if TYPE_CHECKING:
 
     from ...shared.layer_config import LayerSection
     from ...shared.layers.layer import Layer
-    from .gl_layer import GlLayer
+    from .gl_layer import Drawn
 
 TECHNIQUES = ("avc", "triangles", "strips", "instancing")
 
 
-def gl_layer(context: moderngl.Context, layer: Layer, settings: LayerSection) -> GlLayer:
+def gl_layer(context: moderngl.Context, layer: Layer, settings: LayerSection) -> Drawn:
     """The layer on the device. Raises ConfigError for a kind or technique that does not exist."""
     technique = settings.technique
     match layer.kind, technique:
@@ -79,4 +79,12 @@ def gl_layer(context: moderngl.Context, layer: Layer, settings: LayerSection) ->
 
             expand = expand_polygons.triangles if technique == "triangles" else expand_polygons.strips
             return GlMesh(context, layer, settings, expand(layer))
+        case "trajectories", "avc" | "instancing":
+            from .gl_trajectories import GlTrajectories
+
+            return GlTrajectories(context, layer, settings)
+        case "trajectories", "triangles" | "strips":
+            from .gl_trajectories import trajectory_mesh
+
+            return trajectory_mesh(context, layer, settings)
     raise ConfigError(f"layer {layer.name}: technique {technique!r} of {layer.kind}: not found")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from importlib.resources import files
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -24,10 +24,29 @@ COMMAND = np.dtype(
         "itemsize": 20,
     }
 )
-"""Of glMultiDrawArraysIndirect, at the stride that the binding takes."""
+"""Of glMultiDrawArraysIndirect, at the stride that the binding takes; with indices, when only the first three count, of
+glMultiDrawElementsIndirect."""
 
 VARYINGS = ("layer_position", "layer_normal")
 """Outputs of the last stage before rasterization that tests capture: vec3, relative to the layer's origin."""
+
+
+class Drawn(Protocol):
+    """A layer on the device, however many calls draw it."""
+
+    @property
+    def resident_bytes(self) -> int:
+        """Device memory of the layer's records or vertices."""
+        ...
+
+    @property
+    def static_bytes(self) -> int:
+        """Of ``resident_bytes``: templates that are there once, however many objects there are."""
+        ...
+
+    def draw(self, camera: Camera, entries: np.ndarray) -> None:
+        """Draw objects into the framebuffer in use. Raises MessageError for entries beyond the objects."""
+        ...
 
 
 class GlLayer(ABC):
@@ -96,7 +115,7 @@ def commands(
     first: np.ndarray, count: np.ndarray, first_instance: np.ndarray | int = 0, instances: np.ndarray | int = 1
 ) -> np.ndarray:
     """(m,) COMMAND from its columns."""
-    made = np.empty(len(first), COMMAND)
+    made = np.zeros(len(first), COMMAND)
     made["first"], made["count"], made["first_instance"], made["instances"] = first, count, first_instance, instances
     return made
 

@@ -35,7 +35,7 @@ class GlMesh(GlLayer):
             vertex_shader=layer_shader("gradient", "output", "mesh.vert", defines=flat),
             fragment_shader=layer_shader("word", "surface.frag", defines=flat),
         )
-        self._gradient = Gradient(self._context, self._settings, self._layer.objects["value"])
+        self._gradient = Gradient(self._context, self._settings, mesh.value)
         vertices = np.empty(len(mesh.position), VERTEX)
         vertices["position"], vertices["normal"], vertices["value"] = mesh.position, mesh.normal, mesh.value
         buffer = self._context.buffer(vertices)

@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from . import arcs, blocks, cuboids, polygons
+from . import arcs, blocks, cuboids, polygons, trajectories
 from .layer import Layer
 
 
@@ -26,4 +26,10 @@ class Kind(Protocol):
         ...
 
 
-KINDS: Mapping[str, Kind] = {"arcs": arcs, "blocks": blocks, "cuboids": cuboids, "polygons": polygons}  # type: ignore[dict-item]
+KINDS: Mapping[str, Kind] = {
+    "arcs": arcs,  # type: ignore[dict-item]
+    "blocks": blocks,  # type: ignore[dict-item]
+    "cuboids": cuboids,  # type: ignore[dict-item]
+    "polygons": polygons,  # type: ignore[dict-item]
+    "trajectories": trajectories,  # type: ignore[dict-item]
+}

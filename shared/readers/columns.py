@@ -148,6 +148,7 @@ class TableSource(Source):
 
         Raises InputError if x, y or z is missing.
         """
+        self._names = tuple(names)
         roles = find_roles(names)
         if not {"x", "y", "z"} <= roles.keys():
             found = ", ".join(names) or "none"
@@ -165,6 +166,15 @@ class TableSource(Source):
             if not self._colours.present:
                 del self._columns["rgb"]
         self.info = SourceInfo(attributes=tuple(a for a in ATTRIBUTES if a in self._columns), **info)
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """All columns of the file by their own names, also those that no attribute is made of.
+
+        Raises InputError where the file ends early. Memory: the file's points.
+        """
+        names = list(self._names)
+        tables = [[np.asarray(table[name]) for name in names] for table in self._tables(SAMPLE_POINTS, names)]
+        return {name: np.concatenate([table[i] for table in tables]) for i, name in enumerate(names)}
 
     @abstractmethod
     def _tables(self, max_points: int, columns: Collection[str]) -> Iterator[Table]:

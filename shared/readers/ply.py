@@ -14,7 +14,7 @@ from .columns import Table, TableSource
 from .ply_lists import ascii_rows, binary_rows
 from .records import RecordSource
 from .rows import read_rows, skip_rows
-from .source import Source, check_promise, foreign_errors
+from .source import check_promise, foreign_errors
 
 _HEADER_BYTES = 1 << 20
 _TYPES = {
@@ -52,7 +52,7 @@ class Element:
         return sum(np.dtype(length or kind).itemsize for _, kind, length in self.properties)
 
 
-def open_ply(path: Path) -> Source:
+def open_ply(path: Path) -> TableSource:
     """A PLY file. Raises InputError for a malformed header, or counts that the file is too short for."""
     with foreign_errors(path):
         with path.open("rb") as file:

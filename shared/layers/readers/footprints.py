@@ -16,6 +16,7 @@ from .. import cuboids
 from ..layer import Layer, simple_layer
 from ..polygons import bounds as polygon_bounds
 from ..polygons import polygon_layer
+from .degrees import around, metres_per_degree
 from .json_file import read_json
 
 HEIGHT_NAMES = ("height", "building:height", "building_height", "render_height", "measuredheight", "measured_height")
@@ -27,9 +28,6 @@ LEVEL = 3.0
 BASE_NAMES = ("min_height", "building:min_height", "render_min_height")
 """The same for the height at which an object begins."""
 DEFAULT_HEIGHT = 10.0
-
-EQUATOR, FLATTENING = 6378137.0, 1 / 298.257223563
-"""WGS 84: half the long axis, metres."""
 
 
 @dataclass(frozen=True)
@@ -233,17 +231,17 @@ def _in_metres(
         raise InputError(f"{path}: found the position {bad.tolist()}, expected degrees; try --no-degrees")
     reference = every[0, 0]
     longitude = every[:, 0]
-    turned = _around(longitude, reference)
+    turned = around(longitude, reference)
     wraps = np.ptp(turned) < 180 < np.ptp(longitude)  # across the antimeridian
     lower, upper = every.min(axis=0), every.max(axis=0)
     if wraps:
         lower[0], upper[0] = turned.min(), turned.max()
     middle = (lower + upper) / 2
-    scale = _metres_per_degree(middle[1])
+    scale = metres_per_degree(middle[1])
     metres = [
         [
             [
-                (np.column_stack([_around(ring[:, 0], reference), ring[:, 1]]) if wraps else ring) * scale
+                (np.column_stack([around(ring[:, 0], reference), ring[:, 1]]) if wraps else ring) * scale
                 - middle * scale
                 for ring in polygon
             ]
@@ -252,19 +250,6 @@ def _in_metres(
         for polygons in shapes
     ]
     return metres, middle.tolist()
-
-
-def _around(longitude: np.ndarray, reference: float) -> np.ndarray:
-    return reference + (longitude - reference + 180.0) % 360.0 - 180.0
-
-
-def _metres_per_degree(latitude: float) -> np.ndarray:
-    """(2,) along the parallel and the meridian of the WGS 84 ellipsoid."""
-    eccentricity2 = FLATTENING * (2 - FLATTENING)
-    sine = np.sin(np.radians(latitude))
-    across = EQUATOR / np.sqrt(1 - eccentricity2 * sine**2)
-    along = across * (1 - eccentricity2) / (1 - eccentricity2 * sine**2)
-    return np.radians(1) * np.array([across * np.cos(np.radians(latitude)), along])
 
 
 def _is_geographic(crs: str | None) -> bool:
