@@ -16,12 +16,13 @@ from splatpipe.nodes.layers.sizes import layer_bytes
 from splatpipe.nodes.raster.gl_context import gl_available
 from splatpipe.shared.build import BuildSettings, build_scene
 from splatpipe.shared.config import load_config
-from splatpipe.shared.layer_config import ArcStyle, LayerSection
+from splatpipe.shared.layer_config import ArcStyle, LayerSection, TrajectoryStyle
 from splatpipe.shared.layers import arcs, blocks
 from splatpipe.shared.layers.layer import simple_layer
 from splatpipe.shared.layers.layer_store import write_layer
 from splatpipe.shared.layers.polygons import polygon_layer
 from splatpipe.shared.synth import CityScan
+from trajectory_example import random_tracks
 
 needs_gl = pytest.mark.skipif(not gl_available()[0], reason=gl_available()[1])
 
@@ -48,7 +49,14 @@ def some_polygons():
     return polygon_layer("houses", [[[l_shape]], [ring], [[20 + square], [22 + square]]], height, np.arange(3.0))[0]
 
 
-LAYERS = {"cuboids": lambda: random_cuboids(20), "arcs": some_arcs, "blocks": some_blocks, "polygons": some_polygons}
+LAYERS = {
+    "cuboids": lambda: random_cuboids(20),
+    "arcs": some_arcs,
+    "blocks": some_blocks,
+    "polygons": some_polygons,
+    "tubes": lambda: random_tracks(200, 40),
+    "spheres": lambda: random_tracks(200, 3),
+}
 
 
 @pytest.mark.gl
@@ -59,7 +67,8 @@ def test_what_is_counted_is_what_lies_on_the_device(kind, technique):
     from splatpipe.nodes.layers.gl_canvas import GlLayers
 
     layer = LAYERS[kind]()
-    settings = LayerSection(path="", technique=technique, arcs=ArcStyle(segments=9))
+    style = TrajectoryStyle(style="spheres" if kind == "spheres" else "auto", highlight=(0.5, 0.7), selected=("t1",))
+    settings = LayerSection(path="", technique=technique, arcs=ArcStyle(segments=9), trajectories=style)
     with GlLayers([layer], [settings], 16, 16) as canvas:
         resident = canvas.resident_bytes[0]
     template = resident - layer_bytes(layer, settings, technique)

@@ -10,24 +10,33 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .expand_arcs import CLOSED, DEFAULT_SEGMENTS, whole_root
+from .expand_trajectories import CAP, HIDDEN, Look, Templates, segments
 
 if TYPE_CHECKING:
-    from ...shared.layer_config import LayerSection
+    from ...shared.layer_config import LayerSection, TrajectoryStyle
     from ...shared.layers.layer import Layer
 
 VERTEX_BYTES = 28
 """Of a mesh: position, normal, value, all float32."""
 BLOCK_VERTEX_BYTES = 40
 """Of blocks: position, normal, place in the block, type."""
-ELEMENT_BYTES = 20
-"""Of a polygon's element: position, apex, number of its object."""
+POLYGON_ELEMENT_BYTES = 20
+"""Position, apex, number of the object."""
+NODE_BYTES, SEGMENT_BYTES, SELECTION_BYTES = 28, 16, 4
+"""Of trajectories: place, motion and number; four elements; a bit a trajectory, in words."""
 
 
 def layer_bytes(layer: Layer, settings: LayerSection, technique: str) -> int:
     """Bytes on the device of a layer drawn with ``technique``. Cost: a pass over its elements."""
     if technique in ("avc", "instancing"):
-        n_elements = len(layer.elements) + 1 if len(layer.elements) else 0  # one more, for the last one's next
-        return layer.objects.nbytes + ELEMENT_BYTES * n_elements
+        match layer.kind:
+            case "polygons":  # one element more, for the last one's next
+                return layer.objects.nbytes + POLYGON_ELEMENT_BYTES * (len(layer.elements) + 1)
+            case "trajectories":
+                words = len(layer.parameters["names"]) // 32 + 1
+                n_segments = len(segments(layer).index)
+                return NODE_BYTES * len(layer.elements) + SEGMENT_BYTES * n_segments + SELECTION_BYTES * words
+        return layer.objects.nbytes
     vertex_bytes = BLOCK_VERTEX_BYTES if layer.kind == "blocks" else VERTEX_BYTES
     return vertex_bytes * _vertices(layer, settings, as_strips=technique == "strips")
 
@@ -49,4 +58,18 @@ def _vertices(layer: Layer, settings: LayerSection, *, as_strips: bool) -> int:
             drawn = np.array([0, 6, 12, 8])[side + 2 * ends]
             whole = np.concatenate([[0], np.cumsum(drawn)])[layer.first_element]
             return int(drawn.sum()) - int((np.diff(whole) > 0).sum())  # an object's first vertex is there once
+        case "trajectories":
+            sides = settings.trajectories.sides
+            return (2 * sides + 2 if as_strips else 6 * sides) * _trajectory_strips(layer, settings.trajectories)
     return (14 if as_strips else 36) * len(layer)
+
+
+def _trajectory_strips(layer: Layer, style: TrajectoryStyle) -> int:
+    """Strips of ``expand_trajectories.strips``: one a tube, and one for each band of a ball."""
+    parts, look, only_balls = segments(layer), Look.of(layer, style), style.style == "spheres"
+    ends = parts.index[:, 1:3]
+    tubes = np.full(len(ends), not only_balls) | look.is_highlighted(look.value[ends].mean(axis=1), ends[:, 0])
+    nodes = np.flatnonzero(parts.flags & HIDDEN == 0)
+    balls = np.full(len(nodes), only_balls) | (parts.flags[nodes] & CAP > 0)
+    balls |= look.is_highlighted(look.value[nodes], nodes)
+    return int(tubes.sum()) + Templates(style.sides).bands * int(balls.sum())

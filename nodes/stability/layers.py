@@ -8,11 +8,12 @@ from dataclasses import replace
 import numpy as np
 
 from ...shared.camera import Camera
-from ...shared.layer_config import ArcStyle, LayerSection
+from ...shared.layer_config import ArcStyle, LayerSection, TrajectoryStyle
 from ...shared.layers import arcs, blocks, cuboids
 from ...shared.layers.box_octree import box_octree
 from ...shared.layers.layer import Layer, simple_layer
 from ...shared.layers.polygons import polygon_layer
+from ...shared.layers.trajectories import trajectory_layer
 from ...shared.messages import RENDER_POINT
 from ...shared.stability.case import OutOfReach, case, cases, expect
 from .chain import camera_at, is_drawn
@@ -35,7 +36,8 @@ def _draw(layer: Layer, camera: Camera, technique: str = "avc", segments: int = 
         raise OutOfReach(reason)
     from ..layers.gl_canvas import GlLayers
 
-    settings = LayerSection(path="", technique=technique, arcs=ArcStyle(segments=segments))  # type: ignore[arg-type]
+    styles = {"arcs": ArcStyle(segments=segments), "trajectories": TrajectoryStyle(style="tubes")}
+    settings = LayerSection(path="", technique=technique, **styles)  # type: ignore[arg-type]
     entries = np.ones(1, RENDER_POINT)
     entries["offset"], entries["range"] = 0, len(layer)
     with GlLayers([layer], [settings], camera.width, camera.height) as canvas:
@@ -91,6 +93,20 @@ def _changed(objects: np.ndarray, kind: str, **values: object) -> Layer:
     return simple_layer("made", kind, np.zeros(3), objects)
 
 
+def _tracks(track: Callable[[np.ndarray], np.ndarray]) -> Layer:
+    """20 tracks; track : (n,) whole numbers → (n, 3) places of one."""
+    nodes = np.arange(24)
+    places = np.column_stack([_places(20, 7), np.arange(20) % 12])
+    position = np.concatenate([place + track(nodes) for place in places])
+    number = np.repeat(np.arange(20), len(nodes))
+    names = [str(i) for i in range(20)]
+    return trajectory_layer("made", position, number, names, np.tile(nodes.astype(np.float64), 20), radius=2.5)
+
+
+def _winding(node: np.ndarray) -> np.ndarray:
+    return np.column_stack([6 * np.cos(node / 3), 6 * np.sin(node / 3), node / 4])
+
+
 _LAYERS: dict[str, Callable[[], Layer]] = {
     "cuboids of zero extent": lambda: _changed(_cuboids(), "cuboids", extent=0, height=(3, 3)),
     "cuboids flat along x": lambda: _changed(_cuboids(), "cuboids", extent=(0, 9)),
@@ -99,6 +115,9 @@ _LAYERS: dict[str, Callable[[], Layer]] = {
     "arcs of span 0": lambda: _changed(_arcs(), "arcs", angle=(1, 1)),
     "arcs of span 2π": lambda: _changed(_arcs(), "arcs", angle=(1, 1 + 2 * np.pi)),
     "outlines that cross themselves": lambda: _polygons([_BOW_TIE, _SQUARE] * 40),
+    "tracks of repeated points": lambda: _tracks(lambda node: _winding(node // 4 * 4)),
+    "tracks that turn back": lambda: _tracks(lambda node: np.column_stack([node % 2 * 8, node * 0, node * 0])),
+    "tracks of one place": lambda: _tracks(lambda node: _winding(node * 0)),
 }
 
 
@@ -137,6 +156,7 @@ _KINDS: dict[str, Callable[[], Layer]] = {
     "cuboids": lambda: simple_layer("made", "cuboids", np.zeros(3), _cuboids()),
     "arcs": lambda: simple_layer("made", "arcs", np.zeros(3), _arcs()),
     "polygons": lambda: _polygons([_BOW_TIE, _SQUARE] * 40),
+    "trajectories": lambda: _tracks(_winding),
 }
 
 
