@@ -90,8 +90,10 @@ class Look:
 
 
 def values(layer: Layer, style: TrajectoryStyle) -> np.ndarray:
-    """(m,) float32: what the colour map colours."""
-    return layer.elements["position"][:, 2] if style.colour == "height" else layer.elements[style.colour]
+    """(m,) float32: what the colour map colours; heights are of the world."""
+    if style.colour == "height":
+        return layer.elements["position"][:, 2] + np.float32(layer.origin[2])
+    return layer.elements[style.colour]
 
 
 def radius_range(layer: Layer, style: TrajectoryStyle) -> tuple[float, float]:

@@ -75,6 +75,7 @@ class _Shared:
         self._selection.bind_to_storage_buffer(_SELECTION)
         set_uniform(program, "style", STYLES.index(style))
         set_uniform(program, "colour_by", COLOURS.index(self.style.colour))
+        set_uniform(program, "ground", float(self._layer.origin[2]))
         set_uniform(program, "acceleration_range", self._acceleration_range)
         set_uniform(program, "radius_range", self._radius_range)
         set_uniform(program, "highlight", self.style.highlight or (1.0, 0.0))

@@ -1,4 +1,4 @@
-"""Speed and acceleration of nodes, from where and when they were."""
+"""Speed and acceleration of nodes, from where and when they were, and what is missing of them."""
 
 from __future__ import annotations
 
@@ -34,5 +34,21 @@ def derivative(values: np.ndarray, time: np.ndarray, part: np.ndarray) -> np.nda
     after = np.where(np.append(same, False), index + 1, index)
     v, t = values[node], time[node]
     duration = t[after] - t[before]
-    change = np.divide(v[after] - v[before], duration, out=np.zeros(len(node)), where=duration > 0)
+    with np.errstate(over="ignore"):  # of times all but the same
+        change = np.divide(v[after] - v[before], duration, out=np.zeros(len(node)), where=duration > 0)
     return change[group]
+
+
+def filled(values: np.ndarray, time: np.ndarray, part: np.ndarray) -> np.ndarray:
+    """(n,) float64 with values that are not finite put between those that are; NaN in parts where none is.
+
+    time, part : as of ``derivative``.
+    """
+    values = np.where(np.isfinite(values), values, np.nan)
+    missing = np.isnan(values)
+    for p in np.unique(part[missing]):
+        nodes = slice(*np.searchsorted(part, (p, p + 1)))
+        known = ~missing[nodes]
+        if known.any():
+            values[nodes] = np.interp(time[nodes], time[nodes][known], values[nodes][known])
+    return values

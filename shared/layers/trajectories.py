@@ -28,6 +28,7 @@ Source: "Attributed Vertex Clouds", 1.3.5.
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -36,7 +37,7 @@ import numpy as np
 
 from ..errors import InputError
 from .layer import Layer, check_layer
-from .motion import derivative, path_length
+from .motion import derivative, filled, path_length
 
 OBJECT = np.dtype([("trajectory", "<u4")])
 ELEMENT = np.dtype([("position", "<f4", 3), ("time", "<f4"), ("speed", "<f4"), ("acceleration", "<f4"), ("role", "u1")])
@@ -46,6 +47,7 @@ RUN = 32
 REACH = 4.0
 MOST_TRAJECTORIES = 100_000
 NAME_LENGTH = 64
+_NAME_BYTES = 12 << 20  # layer.json holds them
 _LARGEST = 1e30
 
 
@@ -110,10 +112,13 @@ def trajectory_layer(
     Raises InputError for what is not finite, by name, and for more than ``MOST_TRAJECTORIES``.
     Cost: O(n log n).
     """
+    names = [str(n)[:NAME_LENGTH] for n in names]
     if not len(position):
         raise InputError(f"layer {name}: found no node, expected at least one")
     if len(names) > MOST_TRAJECTORIES:
         raise InputError(f"layer {name}: found {len(names)} trajectories, expected at most {MOST_TRAJECTORIES}")
+    if len(json.dumps(names)) > _NAME_BYTES:
+        raise InputError(f"layer {name}: names of trajectories: found more than {_NAME_BYTES} bytes")
     for what, values in (("position", position), *((("time", time),) if time is not None else ())):
         bad = ~(np.abs(values) <= _LARGEST).reshape(len(values), -1).all(axis=1)
         if bad.any():
@@ -130,8 +135,8 @@ def trajectory_layer(
     part = np.cumsum(new) - 1
     moved = derivative(path_length(position, part), when, part)
     if speed is not None:
-        speed = _filled(speed[order], when, part)
-    v = moved if speed is None else np.where(np.isfinite(speed), speed, moved)
+        speed = filled(speed[order], when, part)
+    v = moved if speed is None else np.where(np.isnan(speed), moved, speed)
 
     origin = np.append((position.min(axis=0) + position.max(axis=0))[:2] / 2, position[:, 2].min())
     if radius is None:
@@ -146,25 +151,13 @@ def trajectory_layer(
     objects = np.empty(len(first) - 1, OBJECT)
     objects["trajectory"] = trajectory[source[first[:-1]]]
     parameters |= {
-        "names": [str(n)[:NAME_LENGTH] for n in names],
+        "names": names,
         "time_origin": float(when.min()),
         "radius": radius,
     }
     layer = Layer(name, "trajectories", origin, objects, elements, first, parameters)
     check_layer(layer)
     return layer.in_octree_order()
-
-
-def _filled(speed: np.ndarray, time: np.ndarray, part: np.ndarray) -> np.ndarray:
-    """Speeds that are not known, between those that are; NaN in parts where none is."""
-    speed = np.where(np.isfinite(speed), speed, np.nan)
-    missing = np.isnan(speed)
-    for p in np.unique(part[missing]):
-        nodes = slice(*np.searchsorted(part, (p, p + 1)))
-        known = ~missing[nodes]
-        if known.any():
-            speed[nodes] = np.interp(time[nodes], time[nodes][known], speed[nodes][known])
-    return speed
 
 
 def _runs(position: np.ndarray, part: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -3,6 +3,7 @@
 layout(std430, binding = 1) restrict readonly buffer Selection { uint selection[]; };
 
 uniform int colour_by;           // 0: speed, 1: acceleration, 2: time, 3: height
+uniform float ground;            // height of the layer's origin
 uniform vec2 acceleration_range; // the least and the largest radius belong to these
 uniform vec2 radius_range;
 uniform float near, focal_px;
@@ -13,7 +14,7 @@ Node node_of(vec3 position, vec3 motion, uint owner) {
     float t = span != 0.0 ? clamp((abs(motion.z) - acceleration_range.x) / span, 0.0, 1.0) : 0.5;
     Node n;
     n.position = position;
-    n.value = colour_by == 0 ? motion.y : colour_by == 1 ? motion.z : colour_by == 2 ? motion.x : position.z;
+    n.value = colour_by == 0 ? motion.y : colour_by == 1 ? motion.z : colour_by == 2 ? motion.x : position.z + ground;
     n.radius = mix(radius_range.x, radius_range.y, t);
     n.pixel = max(distance(position, eye), near) / focal_px;
     uint trajectory = owner >> 3;

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from array import array
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import NoReturn
@@ -18,6 +20,7 @@ MOST_POINTS = 20_000_000
 _DEPTH = 32
 _TEXT = 256
 _CHUNK = 1 << 20
+_COLUMNS = ("lon", "lat", "ele", "time", "speed")
 
 
 def read_gpx(path: Path) -> Nodes:
@@ -37,8 +40,7 @@ class _Reader:
         self._track = self._name = ""
         self._n_tracks = self._n_segments = self._n_waypoints = 0
         self._names: list[str] = []
-        self._points: list[list[float]] = []
-        self._trajectory: list[int] = []
+        self._points, self._trajectory = array("d"), array("q")
         self._point: dict[str, float] | None = None
         self._parser = expat.ParserCreate(namespace_separator=" ")
         self._parser.StartElementHandler = self._start
@@ -65,7 +67,7 @@ class _Reader:
         if not self._points:
             found = f", {self._n_waypoints} waypoints" if self._n_waypoints else ""
             raise InputError(f"{self._path}: found no point of a track or route{found}, expected at least one")
-        values = np.array(self._points)
+        values = np.array(self._points).reshape(-1, len(_COLUMNS))
         notes = [f"left out: {self._n_waypoints:,} waypoints"] if self._n_waypoints else []
         has_speed = np.isfinite(values[:, 4]).any()
         return Nodes(
@@ -116,7 +118,7 @@ class _Reader:
     def _begin_point(self, attributes: dict[str, str]) -> None:
         if self._open[-2:-1] not in (["trkseg"], ["rte"]) or not self._names:
             raise self._wrong("found a point of a track that is in none")
-        if len(self._points) >= MOST_POINTS:
+        if len(self._trajectory) >= MOST_POINTS:
             raise self._wrong(f"found more than {MOST_POINTS} points")
         lon, lat = (self._number(attributes.get(key, ""), key) for key in ("lon", "lat"))
         if not (abs(lon) <= 360 and abs(lat) <= 90):
@@ -135,7 +137,7 @@ class _Reader:
         parent = self._open[-1] if self._open else ""
         if name in ("trkpt", "rtept") and self._point is not None:
             p = self._point
-            self._points.append([p.get(key, np.nan) for key in ("lon", "lat", "ele", "time", "speed")])
+            self._points.extend(p.get(key, math.nan) for key in _COLUMNS)
             self._trajectory.append(len(self._names) - 1)
             self._point = None
         elif self._point is not None and text:
@@ -152,7 +154,7 @@ class _Reader:
         try:
             number = float(text)
         except ValueError:
-            number = np.nan
+            number = math.nan
         if not abs(number) <= 1e9:
             raise self._wrong(f"{what}: found {text[:40]!a}, expected a number")
         return number

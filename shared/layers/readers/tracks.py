@@ -9,6 +9,7 @@ import numpy as np
 
 from ...errors import InputError
 from ..layer import Layer
+from ..motion import filled
 from ..trajectories import trajectory_layer, typical_gap
 from .degrees import around, metres_per_degree
 from .table import read_table
@@ -99,7 +100,7 @@ def trajectories_from_file(path: Path, rules: TrackRules) -> tuple[Layer, list[s
     speed = None if nodes.speed is None else nodes.speed[known]
     if time is None:
         notes.append("time: none, nodes are counted instead: speed is the way from node to node")
-    position[:, 2] = _between(position[:, 2], trajectory, time)
+    position[:, 2] = _heights(position[:, 2], trajectory, time)
     parameters: dict[str, object] = {"source": path.name}
     if nodes.degrees:
         position[:, :2], middle = _in_metres(path, position[:, :2])
@@ -173,6 +174,8 @@ def _some(table: dict[str, np.ndarray]) -> str:
 
 
 def _numbers(path: Path, name: str, values: np.ndarray) -> np.ndarray:
+    if values.dtype.kind == "O" and all(value is None for value in values):  # a column that is empty throughout
+        return np.full(len(values), np.nan)
     if values.dtype.kind not in "iuf":
         raise InputError(f"{path}: column {name}: found {values.dtype}, expected numbers")
     return values.astype(np.float64)
@@ -196,20 +199,15 @@ def _names(values: np.ndarray) -> tuple[list[str], np.ndarray]:
     return [str(name) for name in distinct.tolist()], trajectory.ravel().astype(np.int64)
 
 
-def _between(values: np.ndarray, trajectory: np.ndarray, time: np.ndarray | None) -> np.ndarray:
-    """Values that are not known, between those that are; 0 in trajectories where none is."""
-    known = np.isfinite(values)
-    if known.all():
-        return values
-    values = values.copy()
-    for number in np.unique(trajectory[~known]):
-        nodes = np.flatnonzero(trajectory == number)
-        if time is not None:
-            nodes = nodes[np.argsort(time[nodes], kind="stable")]
-        at = np.arange(len(nodes)) if time is None else time[nodes]
-        has = known[nodes]
-        values[nodes] = np.interp(at, at[has], values[nodes][has]) if has.any() else 0.0
-    return values
+def _heights(height: np.ndarray, trajectory: np.ndarray, time: np.ndarray | None) -> np.ndarray:
+    """Heights that are not known, between those that are; 0 in trajectories where none is."""
+    if np.isfinite(height).all():
+        return height
+    when = np.arange(len(height), dtype=np.float64) if time is None else time
+    order = np.lexsort((when, trajectory))
+    found = np.empty(len(height))
+    found[order] = np.nan_to_num(filled(height[order], when[order], trajectory[order]))
+    return found
 
 
 def _in_metres(path: Path, degrees: np.ndarray) -> tuple[np.ndarray, list[float]]:
