@@ -16,6 +16,7 @@ from splatpipe.nodes.layers.expand_trajectories import (
 )
 from splatpipe.nodes.layers.mesh import separate
 from splatpipe.nodes.raster.gl_context import gl_available
+from splatpipe.shared.camera import look_at, perspective_camera
 from splatpipe.shared.errors import ConfigError, InputError
 from splatpipe.shared.layer_config import LayerSection, TrajectoryStyle
 from splatpipe.shared.layers.layer import Layer, check_layer
@@ -326,6 +327,17 @@ def test_auto_draws_lines_far_and_tubes_near_and_selected_ones_as_tubes_with_sph
     assert len(some[1]) == of_selected.sum() * 16 * 3
     nodes = ((number == 1) & (parts.flags & HIDDEN == 0)).sum()
     assert len(some[2]) == nodes * 4 * 16 * 3
+
+
+@pytest.mark.gl
+@needs_gl
+def test_a_segment_that_passes_the_eye_is_a_tube_though_its_ends_are_far():
+    layer = track([(-500, 0, 0), (500, 0, 0)], radius=0.5)
+    pose = look_at(np.array([0.0, -10.0, 3.0]), np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    camera = perspective_camera(frame=0, world_from_camera=pose, fov_y_rad=0.8, width=160, height=120, near=0.1)
+    auto, tubes, lines = (picture(layer, camera, style=style, tube_px=4) for style in ("auto", "tubes", "lines"))
+    assert np.array_equal(auto, tubes)
+    assert (lines != FRAMEBUFFER_EMPTY).sum() < 0.5 * (tubes != FRAMEBUFFER_EMPTY).sum()
 
 
 @pytest.mark.gl

@@ -11,6 +11,7 @@ uniform int style;
 uniform vec2 highlight;          // values that are drawn as if selected
 uniform float tube_px;           // tubes narrower than this are lines, where the style is auto
 uniform vec3 eye;
+uniform float near, focal_px;
 
 // Of length 1; 0 stays 0. No square overflows or vanishes.
 vec3 direction(vec3 v) {
@@ -31,10 +32,19 @@ bool is_highlighted(float value, uint flags) {
     return (flags & SELECTED) != 0u || (value >= highlight.x && value <= highlight.y);
 }
 
+float pixel_at(vec3 position) { return max(distance(position, eye), near) / focal_px; }
+
 bool is_near(Node n) { return 2.0 * n.radius >= tube_px * n.pixel; }
 
+// Whether a segment is as wide as tubes are anywhere: it may pass the eye with both its ends far away.
+bool is_near(Node start, Node end) {
+    vec3 along = end.position - start.position;
+    float t = clamp(dot(eye - start.position, along) / max(dot(along, along), 1e-30), 0.0, 1.0);
+    return 2.0 * max(start.radius, end.radius) >= tube_px * pixel_at(start.position + t * along);
+}
+
 bool is_tube(Node start, Node end, float value) {
-    return is_highlighted(value, start.flags) || style == TUBES || (style == AUTO && (is_near(start) || is_near(end)));
+    return is_highlighted(value, start.flags) || style == TUBES || (style == AUTO && is_near(start, end));
 }
 
 // Radius of the ball at a node, 0 for none; negative: a disc.

@@ -6,7 +6,6 @@ uniform int colour_by;           // 0: speed, 1: acceleration, 2: time, 3: heigh
 uniform float ground;            // height of the layer's origin
 uniform vec2 acceleration_range; // the least and the largest radius belong to these
 uniform vec2 radius_range;
-uniform float near, focal_px;
 
 // motion: time, speed, acceleration.  owner: 8 × number of the trajectory + HIDDEN, CAP, ALONE
 Node node_of(vec3 position, vec3 motion, uint owner) {
@@ -16,7 +15,7 @@ Node node_of(vec3 position, vec3 motion, uint owner) {
     n.position = position;
     n.value = colour_by == 0 ? motion.y : colour_by == 1 ? motion.z : colour_by == 2 ? motion.x : position.z + ground;
     n.radius = mix(radius_range.x, radius_range.y, t);
-    n.pixel = max(distance(position, eye), near) / focal_px;
+    n.pixel = pixel_at(position);
     uint trajectory = owner >> 3;
     bool selected = (selection[trajectory >> 5] >> (trajectory & 31u) & 1u) == 1u;
     n.flags = (owner & 7u) | (selected ? SELECTED : 0u);
