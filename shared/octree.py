@@ -44,7 +44,8 @@ class Octree:
         is drawn whole; 0 for a cell that has none.
     pool_bytes : (n,) uint32 or None, bytes of that form.  pool_bits : bits an axis of its grid; 0 where there is none.
     point_order : ``layered`` (an inner cell owns its own level-of-detail set, of which any prefix is a
-        fair sample) or ``depth-first`` (points in leaves only, an inner cell's range spans its leaves).
+        fair sample), ``depth-first`` (points in leaves only, an inner cell's range spans its leaves) or ``additive``
+        (a cell's own range is drawn with those of all cells above it: objects of a layer, ``layers.box_octree``).
     """
 
     origin: np.ndarray
