@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from .section import Section
 
@@ -25,7 +25,13 @@ class BlockStyle(Section):
     texture: Literal["grain", "plain"] = "grain"
 
 
-_Range = tuple[()] | tuple[float, float]
+def _none_or_two(numbers: tuple[float, ...]) -> tuple[float, ...]:
+    if len(numbers) not in (0, 2):
+        raise ValueError("expected no number or two")
+    return numbers
+
+
+_Range = Annotated[tuple[float, ...], AfterValidator(_none_or_two)]
 
 
 class TrajectoryStyle(Section):

@@ -97,6 +97,7 @@ def test_boxes_hold_what_is_drawn(seed):
         mesh = strips(layer, TrajectoryStyle(style=style, radius=(0.0, 2.0), selected=("t1",)))
         owner = np.repeat(np.arange(len(layer)), np.diff(mesh.first_vertex))
         lower, upper = (corner[owner] - layer.origin for corner in layer.bounds)
+        np.testing.assert_allclose(np.linalg.norm(mesh.normal, axis=1), 1, atol=1e-6)
         slack = 1e-5 * REACH * layer.parameters["radius"] + 1e-7
         assert (mesh.position >= lower - slack).all()
         assert (mesh.position <= upper + slack).all()
@@ -192,6 +193,19 @@ def test_layers_survive_the_disk(tmp_path):
         assert np.array_equal(a, b)
     assert again.parameters == layer.parameters
     assert np.array_equal(again.octree.n_points, layer.octree.n_points)
+
+
+@pytest.mark.parametrize("up", [(0, 0, 1), (0, 0, -1), (1, 0, 0), (1e-20, 0, 0), (1e20, 1e20, 1e20)])
+def test_tubes_have_normals_in_any_direction_and_size(up):
+    mesh = strips(track(np.arange(4.0)[:, None] * np.array(up)), TrajectoryStyle(style="tubes"))
+    np.testing.assert_allclose(np.linalg.norm(mesh.normal, axis=1), 1, atol=1e-6)
+    assert np.isfinite(mesh.position).all()
+
+
+@pytest.mark.parametrize("numbers", [(1.0,), (1.0, 2.0, 3.0)])
+def test_ranges_have_no_number_or_two(numbers):
+    with pytest.raises(ValueError, match="no number or two"):
+        TrajectoryStyle(highlight=numbers)
 
 
 def edges(triangles):

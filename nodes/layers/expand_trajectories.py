@@ -63,13 +63,13 @@ def segments(layer: Layer) -> Segments:
 class Look:
     """What the transfer function makes of nodes, whatever is drawn of them.
 
-    value, radius : (m,) float64.  highlighted : (m,) bool, of the nodes; of segments it needs their own value.
+    value, radius : (m,) float64.  selected : (m,) bool.  highlight : least and largest value that is drawn so too.
     """
 
     value: np.ndarray
     radius: np.ndarray
     selected: np.ndarray
-    highlight: tuple[float, float]
+    highlight: tuple[float, ...]
 
     @classmethod
     def of(cls, layer: Layer, style: TrajectoryStyle) -> Look:
@@ -105,7 +105,8 @@ def radius_range(layer: Layer, style: TrajectoryStyle) -> tuple[float, float]:
 def acceleration_range(layer: Layer, style: TrajectoryStyle) -> tuple[float, float]:
     """That of the configuration, else from 0 up to what 98 % of the nodes stay below."""
     if style.acceleration_range:
-        return style.acceleration_range
+        low, high = style.acceleration_range
+        return low, high
     nodes = layer.elements["role"] != NEIGHBOUR
     return 0.0, float(np.quantile(np.abs(layer.elements["acceleration"][nodes]), 0.98))
 
