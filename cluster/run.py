@@ -16,6 +16,7 @@ from rich.console import Console
 from ..shared.config import RunConfig, load_config
 from ..shared.errors import ConfigError, InputError, SplatpipeError
 from ..shared.files import write_json
+from ..shared.layers.kinds import objects_of
 from .job import Job
 from .launch import EXPECTED_RANKS, inside_mpi, launch, mpi_available, record, say_failed
 from .plan.needs import left_out
@@ -195,7 +196,8 @@ def _tell(summary: dict[str, Any]) -> None:
     )
     for i, layer in enumerate(summary["layers"]):
         drawn = mean(of_layers[i] for of_layers in summary["per_frame"]["objects"])
-        console.print(f"  layer {layer['name']}: {drawn:,.0f} of {layer['objects']:,} {layer['kind']} a frame")
+        of = f"{layer['objects']:,} {objects_of(layer['kind'])}"
+        console.print(f"  layer {layer['name']}: {drawn:,.0f} of {of} a frame")
     for path in summary["output"]:
         console.print(f"  wrote {path}")
     if summary["left_out"]:

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from ...shared.layers.kinds import objects_of
 from ...shared.layers.layer import Layer
 from ...shared.layers.layer_store import write_layer
 
@@ -20,4 +21,4 @@ def save(layer: Layer, output: Path, overwrite: bool) -> None:
     write_layer(layer, output, overwrite=overwrite)
     lower, upper = layer.bounds
     size = " × ".join(f"{s:.4g}" for s in upper.max(axis=0) - lower.min(axis=0))
-    Console(highlight=False, soft_wrap=True).print(f"wrote {output}: {len(layer):,} {layer.kind}, {size}")
+    Console(highlight=False, soft_wrap=True).print(f"wrote {output}: {len(layer):,} {objects_of(layer.kind)}, {size}")

@@ -263,11 +263,13 @@ def _layers(job: Job, work: Workload) -> list[Part]:
     if not job.layers:
         return [Part(LAYERS, True, "no [[layers]]: no OpenGL and no shader for them", None, "MB resident", "counted")]
     from ...nodes.layers.sizes import layer_bytes
+    from ...shared.layers.kinds import objects_of
 
     found = []
     for layer, settings, drawn in zip(job.layers, job.config.layers, work.objects, strict=True):
         held, as_triangles = (layer_bytes(layer, settings, how) for how in (settings.technique, "triangles"))
-        why = f"{len(layer):,} {layer.kind}, {drawn:,.0f} a frame, as {settings.technique}: {_size(held)} resident"
+        why = f"{len(layer):,} {objects_of(layer.kind)}, {drawn:,.0f} a frame, as {settings.technique}: "
+        why += f"{_size(held)} resident"
         if settings.technique != "triangles":
             why += f", as triangles {_size(as_triangles)}"
         found.append(Part(f"layer {layer.name}", False, why, 1e-6 * held, "MB resident", "counted"))

@@ -33,3 +33,8 @@ KINDS: Mapping[str, Kind] = {
     "polygons": polygons,  # type: ignore[dict-item]
     "trajectories": trajectories,  # type: ignore[dict-item]
 }
+
+
+def objects_of(kind: str) -> str:
+    """What objects of a kind are called, for people."""
+    return "runs of trajectories" if kind == "trajectories" else kind
