@@ -22,9 +22,11 @@ def read_table(path: Path) -> dict[str, np.ndarray]:
         ) from None
     try:
         table = parquet.read_table(path) if path.suffix.lower() == ".parquet" else csv.read_csv(path)
-    except (OSError, pa.ArrowException) as error:
+        return {name: column.to_numpy() for name, column in zip(table.column_names, table.columns, strict=True)}
+    except (OSError, ValueError, pa.ArrowException) as error:  # ValueError: names that are no UTF-8
         raise InputError(f"{path}: cannot be read: {str(error).splitlines()[0]}") from None
-    return {name: column.to_numpy() for name, column in zip(table.column_names, table.columns, strict=True)}
+    if not table.num_rows:
+        raise InputError(f"{path}: found no row, expected at least one")
 
 
 def column(table: dict[str, np.ndarray], name: str, path: Path, default: float | None = None) -> np.ndarray:
