@@ -155,6 +155,8 @@ def test_tracks_across_the_antimeridian_stay_short(tmp_path):
         ("x,y\n1e35,2\n", "position of node 0"),
         ("x,y\n1,2\n3\n", "cannot be read"),
         ("", "cannot be read"),
+        (b"x,y,\xd4\n1,2,3\n", "cannot be read"),
+        ('"x\ny",b\n1,2\n', "expected x and y"),
     ],
 )
 def test_bad_tables_are_one_line(tmp_path, text, said):

@@ -170,7 +170,7 @@ def _of_columns(path: Path, table: dict[str, np.ndarray], rules: TrackRules) -> 
 
 
 def _some(table: dict[str, np.ndarray]) -> str:
-    return ", ".join(str(name)[:40] for name in list(table)[:20])
+    return ", ".join(f"{name[:40]!a}"[1:-1] for name in list(table)[:20])
 
 
 def _numbers(path: Path, name: str, values: np.ndarray) -> np.ndarray:
