@@ -22,11 +22,12 @@ def read_table(path: Path) -> dict[str, np.ndarray]:
         ) from None
     try:
         table = parquet.read_table(path) if path.suffix.lower() == ".parquet" else csv.read_csv(path)
-        return {name: column.to_numpy() for name, column in zip(table.column_names, table.columns, strict=True)}
+        columns = {name: values.to_numpy() for name, values in zip(table.column_names, table.columns, strict=True)}
     except (OSError, ValueError, pa.ArrowException) as error:  # ValueError: names that are no UTF-8
         raise InputError(f"{path}: cannot be read: {str(error).splitlines()[0]}") from None
     if not table.num_rows:
         raise InputError(f"{path}: found no row, expected at least one")
+    return columns
 
 
 def column(table: dict[str, np.ndarray], name: str, path: Path, default: float | None = None) -> np.ndarray:
@@ -49,7 +50,7 @@ def cuboids_from_table(path: Path) -> Layer:
     x, y, width, depth, height = (column(table, name, path) for name in ("x", "y", "width", "depth", "height"))
     base = column(table, "base", path, 0.0)
     value = column(table, "value", path) if "value" in table else height
-    origin = np.array([x.mean(), y.mean(), base.min()]) if len(x) else np.zeros(3)
+    origin = np.array([x.mean(), y.mean(), base.min()])
     objects = np.empty(len(x), OBJECT)
     objects["center"] = np.column_stack([x, y]) - origin[:2]
     objects["extent"] = np.column_stack([width, depth])
