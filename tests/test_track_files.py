@@ -147,7 +147,7 @@ def test_tracks_across_the_antimeridian_stay_short(tmp_path):
     ("text", "said"),
     [
         ("a,b\n1,2\n", "expected x and y, or lon and lat"),
-        ("x,y\n", "no node"),
+        ("x,y\n", "no row"),
         ("x,y\n1,a\n", "column y: found"),
         ("x,y,time\n1,2,soon\n", "column time: found"),
         ("x,y\nnan,2\n", "no node with a position"),
