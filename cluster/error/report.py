@@ -171,12 +171,19 @@ def _diagrams(rows: list[Row], cost: Axis) -> Any:
 
 
 def _diagram(panel: Any, rows: list[Row], methods: list[str], cost: Axis, error: Axis) -> None:
-    from matplotlib.ticker import LogFormatter
+    from matplotlib.ticker import EngFormatter, LogFormatter
+
+    class ShortFormatter(LogFormatter):
+        """2M for 2e+06: neighbouring labels of an axis of bytes would overlap."""
+
+        def __call__(self, x: float, pos: int | None = None) -> str:
+            text = super().__call__(x, pos)
+            return EngFormatter(sep="")(x) if text and x >= 1e4 else text
 
     panel.set(xscale="log", yscale="log", xlabel=cost.label, ylabel=error.label)
     for axis in (panel.xaxis, panel.yaxis):  # plain numbers: typesetting powers of ten is most of the cost of a figure
-        axis.set_major_formatter(LogFormatter())
-        axis.set_minor_formatter(LogFormatter(minor_thresholds=(1.0, 0.5)))
+        axis.set_major_formatter(ShortFormatter())
+        axis.set_minor_formatter(ShortFormatter(minor_thresholds=(1.0, 0.5)))
     panel.grid(which="both", alpha=0.25, linewidth=0.5)
     panel.margins(x=0.14, y=0.08)
     positive = [row[error.column] for row in rows if row[error.column] > 0]
