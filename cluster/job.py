@@ -30,6 +30,7 @@ from ..shared.octree import Octree
 from ..shared.store import Scene
 from ..shared.views import camera_views
 from .sink import FrameSink, layer_name
+from .topologies import check_topology
 
 if TYPE_CHECKING:
     from ..nodes.layer_render import LayerRenderNode
@@ -44,7 +45,7 @@ class Job:
 
     Frames are what the pipeline draws, views of pictures: ``n_frames`` of ``views.width`` × ``views.height`` pixels,
     ``views.per_picture`` to a picture. Sizes of points are in drawn pixels, so that they do not depend on
-    ``render.supersampling`` in the picture.
+    ``render.supersampling`` in the picture. ``threads`` is for whoever shares the cores with other ranks to lower.
 
     scene : the one to draw; default: that of ``scene.path``, or one without points where there are only layers.
     """
@@ -52,7 +53,9 @@ class Job:
     def __init__(self, config: RunConfig, scene: Scene | None = None) -> None:
         if scene is None and not (config.scene.path or config.layers):
             raise ConfigError("scene.path: missing, expected a scene directory made by splatpipe build")
+        check_topology(config)
         self.config = config
+        self.threads = config.render.threads or len(os.sched_getaffinity(0))
         self.layers = [open_layer(layer.path) for layer in config.layers]
         if self.layers:
             require_gl("layers are drawn with OpenGL")
@@ -194,9 +197,9 @@ class Job:
         """The points of this run, with what it needs of them; coded ones are decoded. Raises StoreError."""
         return load_points(self.scene, self.colouring, self.wanted, verify=verify)
 
-    def load_drawn(self, *, verify: bool) -> ResidentPoints | ResidentGroups:
-        """The points of this run in the form it draws them from. Raises StoreError."""
-        return load_drawn(self.scene, self.colouring, self.wanted, verify=verify)
+    def load_drawn(self, scene: Scene | None = None, *, verify: bool) -> ResidentPoints | ResidentGroups:
+        """The points of this run, or of a share of its scene, in the form it draws them from. Raises StoreError."""
+        return load_drawn(scene or self.scene, self.colouring, self.wanted, verify=verify)
 
     def make_rasterizer(self, points: ResidentPoints | ResidentGroups) -> Rasterizer:
         """The rasterizer of this run over ``points``; the caller closes it. Raises DeviceError."""
@@ -207,16 +210,21 @@ class Job:
             self.views.width,
             self.views.height,
             self.point_size,
-            render.threads or None,
+            self.threads,
             splats=self.splats,
             compact=self.compact,
         )
 
     @contextmanager
-    def open_render(self, progress: Callable[[str, int], None]) -> Iterator[RenderStage]:
-        """The render node of this run with its points loaded, its kernels compiled and its output open."""
+    def open_render(
+        self, progress: Callable[[str, int], None], scene: Scene | None = None, *, shown: bool = True
+    ) -> Iterator[RenderStage]:
+        """The render node of this run with its points loaded, its kernels compiled and its output open.
+
+        scene : a share of the run's, whose points are drawn.  shown : whether pictures are made of what is drawn.
+        """
         progress("loading points", 0)
-        points = self.load_drawn(verify=self.config.scene.verify)
+        points = self.load_drawn(scene, verify=self.config.scene.verify)
         output = self.config.output
         with ExitStack() as stack:
             rasterizer = stack.enter_context(self.make_rasterizer(points))
@@ -231,7 +239,7 @@ class Job:
                 layers = stack.enter_context(self._open_layers())
                 layers.warm_up(self.camera(0))
             composer = sink = None
-            if output.png or output.mp4 or output.depth or output.normals:
+            if shown and (output.png or output.mp4 or output.depth or output.normals):
                 composer = stack.enter_context(Composer(self.picture_settings))
                 composer.warm_up([self.camera(view) for view in range(self.views.per_picture)])
                 sink = stack.enter_context(FrameSink(self.output, png=output.png, mp4=output.mp4, fps=output.fps))
@@ -262,7 +270,7 @@ class Job:
             colours=output.png or output.mp4,
             depth=output.depth,
             normals=output.normals,
-            threads=render.threads or len(os.sched_getaffinity(0)),
+            threads=self.threads,
         )
 
     @property
@@ -316,9 +324,17 @@ class RenderStage:
 
     def draw(self, camera: Camera, chosen: RenderPoints, of_layers: Sequence[RenderPoints] = ()) -> Picture | None:
         """Draw a frame; the picture that it completes, None before its last view or where nobody wants it."""
+        return self.compose(camera, self.rasterize(camera, chosen, of_layers))
+
+    def rasterize(self, camera: Camera, chosen: RenderPoints, of_layers: Sequence[RenderPoints] = ()) -> np.ndarray:
+        """(height, width) uint64 framebuffer words of a frame; valid until the next call."""
         words = self._node.process(camera, chosen)
         if self._layers is not None:
             words = self._layers.process(camera, of_layers, words)
+        return words
+
+    def compose(self, camera: Camera, words: np.ndarray) -> Picture | None:
+        """The picture that the words of a frame complete, as of ``draw``."""
         if self._composer is None:
             return None
         return self._composer.add(camera.frame % self._per_picture, camera, words)

@@ -9,7 +9,8 @@ the scene is delivered by messages, the sampling rank reads the render rank's ha
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from ..shared.config import RunConfig
@@ -23,18 +24,56 @@ from ..shared.messages import (
 from .delivery import receive_scene, serve_scene
 from .job import Job
 from .record import FrameCounts, StageClock, rank_record, spread_ms
+from .topologies import PIPELINE_ROLES as ROLES
 from .transport import Transport
 
 CULLING, SAMPLING, RENDER = range(3)
-ROLES = ("culling", "sampling", "render")
 _MAX_CAMERA_BYTES = 1 << 10
 
 Progress = Callable[[str, int], None]
 """Called with what is going on and how many frames are done."""
 
 
+@dataclass(frozen=True)
+class Drawn:
+    """What a rank that does everything itself has to say of its frames.
+
+    clocks : of culling, sampling and render.  times : of encoding, by kind of output.
+    started, drawn : when the first frame began and the last one was drawn (``time.perf_counter``).
+    """
+
+    clocks: list[StageClock]
+    counts: FrameCounts
+    times: dict[str, list[float]]
+    rasterizer: str
+    loading_s: float
+    started: float
+    drawn: float
+
+    def record(self) -> dict[str, Any]:
+        """The statistics of a run of these frames, but for its ranks and messages."""
+        return {
+            "rasterizer": self.rasterizer,
+            "stages": {clock.stage: clock.summary() for clock in self.clocks},
+            "latency_ms": spread_ms([sum(t) for t in zip(*(clock.work_s for clock in self.clocks), strict=True)]),
+            "per_frame": {f"{clock.stage}_s": clock.work_s for clock in self.clocks} | self.counts.lists() | self.times,
+            "loading_s": self.loading_s,
+            "rendered_s": self.drawn - self.started,
+            "finished_s": time.perf_counter() - self.started,
+        }
+
+
 def run_single(job: Job, progress: Progress) -> dict[str, Any]:
     """All three nodes in this process, frame after frame; the statistics of the run. Imports no MPI."""
+    drawn = draw_alone(job, range(job.n_frames), progress, lambda: None)
+    return drawn.record() | {"ranks": [rank_record("single", 0)], "messages": {}}
+
+
+def draw_alone(job: Job, frames: Sequence[int], progress: Progress, ready: Callable[[], None]) -> Drawn:
+    """Draw frames, views of whole pictures, with all three nodes in this process, and write the pictures.
+
+    ready : called when all is loaded, before the first frame.
+    """
     loading = time.perf_counter()
     clocks = [StageClock(role) for role in ROLES]
     counts = FrameCounts()
@@ -43,9 +82,10 @@ def run_single(job: Job, progress: Progress) -> dict[str, Any]:
     layers = job.layer_nodes()
     sampling.process(job.camera(0), culling.process(job.camera(0)))  # compiles, or loads what was compiled
     with job.open_render(progress) as render:
+        ready()
         started = time.perf_counter()
         loading_s = started - loading
-        for frame in range(job.n_frames):
+        for done, frame in enumerate(frames, 1):
             camera = job.camera(frame)
             with clocks[CULLING].working():
                 bits = culling.process(camera)
@@ -59,19 +99,9 @@ def run_single(job: Job, progress: Progress) -> dict[str, Any]:
                 render.show(frame, picture)
             counts.add(bits, chosen)
             counts.add_layers(of_layers)
-            progress("rendering", frame + 1)
-        rendered_s = time.perf_counter() - started
-    return {
-        "rasterizer": render.description,
-        "ranks": [rank_record("single", 0)],
-        "stages": {clock.stage: clock.summary() for clock in clocks},
-        "messages": {},
-        "latency_ms": spread_ms([sum(t) for t in zip(*(clock.work_s for clock in clocks), strict=True)]),
-        "per_frame": {f"{clock.stage}_s": clock.work_s for clock in clocks} | counts.lists() | render.times(),
-        "loading_s": loading_s,
-        "rendered_s": rendered_s,
-        "finished_s": time.perf_counter() - started,
-    }
+            progress("rendering", done)
+        drawn = time.perf_counter()
+    return Drawn(clocks, counts, render.times(), render.description, loading_s, started, drawn)
 
 
 def run_pipelined(job: Job, transport: Transport, progress: Progress) -> dict[str, Any] | None:

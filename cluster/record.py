@@ -50,10 +50,12 @@ class StageClock:
 class FrameCounts:
     """How much of everything each frame had: cells that may be seen, render-points entries, points drawn;
     of those, the pooled ones; objects of layers.
+
+    lists : counts to begin with, as of ``lists``.
     """
 
-    def __init__(self) -> None:
-        self._lists: dict[str, list[Any]] = {}
+    def __init__(self, lists: dict[str, list[Any]] | None = None) -> None:
+        self._lists: dict[str, list[Any]] = {} if lists is None else lists
 
     def add(self, *messages: VisibilityBits | RenderPoints) -> None:
         """Count a frame's messages. Outside the stage clocks: it is no work of the pipeline."""
@@ -85,13 +87,14 @@ def spread_ms(seconds: list[float]) -> dict[str, float]:
 
 
 def rank_record(role: str, rank: int) -> dict[str, Any]:
-    """Who this rank is: role, host, process, cores it may use, peak resident memory so far."""
+    """Who this rank is: role, host, process, cores it may use, resident memory now and at its peak so far."""
     return {
         "rank": rank,
         "role": role,
         "host": platform.node(),
         "pid": os.getpid(),
         "cores": len(os.sched_getaffinity(0)),
+        "rss_bytes": int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize(),
         "peak_rss_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
     }
 

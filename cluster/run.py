@@ -6,14 +6,15 @@ import hashlib
 import json
 import os
 import time
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from statistics import mean
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from ..shared.config import RunConfig, load_config
+from ..shared.config import PipelineSection, RunConfig, load_config
 from ..shared.errors import ConfigError, InputError, SplatpipeError
 from ..shared.files import write_json
 from ..shared.layers.kinds import objects_of
@@ -25,10 +26,15 @@ from .plan.workload import Workload
 from .progress import FrameProgress
 from .record import RECORD_VERSION, machine_record
 from .sink import prepare_output
+from .topologies import EQUAL_RANKS, FRAME_PARALLEL, check_world, ranks_to_start, role_of
 
-PIPELINED_RANKS = 3
+if TYPE_CHECKING:
+    from .transport import Transport
+
 DECISION = "SPLATPIPE_DECISION"
 """Environment variable in which the launcher tells its ranks why they are."""
+MPIEXEC_ENDS_US_S = 2.0
+"""How long a rank whose MPI call failed keeps quiet: a rank that died is to be named, not the one that noticed."""
 
 
 def run_command(config_path: Path, overrides: list[str], json_path: Path | None) -> int:
@@ -36,8 +42,9 @@ def run_command(config_path: Path, overrides: list[str], json_path: Path | None)
     if inside_mpi():
         return _run_rank(config_path, overrides, json_path)
     config = load_config(config_path, overrides)
-    if config.pipeline.topology == "pipelined" and not mpi_available():
-        raise ConfigError("pipeline.topology = 'pipelined': MPI is missing; install splatpipe[mpi] or choose 'single'")
+    wanted = config.pipeline.topology
+    if wanted not in ("auto", "single") and not mpi_available():
+        raise ConfigError(f"pipeline.topology = {wanted!r}: MPI is missing; install splatpipe[mpi] or choose 'single'")
     job = Job(config)  # everything that can be wrong with the input is said here, before anything starts
     prepare_output(job.output)
     with FrameProgress(job.n_frames) as progress:
@@ -48,7 +55,8 @@ def run_command(config_path: Path, overrides: list[str], json_path: Path | None)
 
             summary = _finish(job, decision, run_single(job, progress.show), config_path, json_path)
         else:
-            status = _run_ranks(config_path, overrides, json_path, decision, progress)
+            ranks = ranks_to_start(config.pipeline, decision.topology)
+            status = _run_ranks(config_path, overrides, json_path, ranks, decision, progress)
             if status:
                 return status  # the rank that failed has said why
             summary = json.loads((job.output / "run.json").read_text())
@@ -57,7 +65,12 @@ def run_command(config_path: Path, overrides: list[str], json_path: Path | None)
 
 
 def _run_ranks(
-    config_path: Path, overrides: list[str], json_path: Path | None, decision: Decision, progress: FrameProgress
+    config_path: Path,
+    overrides: list[str],
+    json_path: Path | None,
+    ranks: int,
+    decision: Decision,
+    progress: FrameProgress,
 ) -> int:
     """Start the ranks and show what they report; their exit status."""
     arguments = ["run", str(config_path)]
@@ -67,7 +80,7 @@ def _run_ranks(
         arguments += ["--json", str(json_path)]
     return launch(
         arguments,
-        PIPELINED_RANKS,
+        ranks,
         lambda content: progress.show(content["doing"], content["done"]),
         {DECISION: decision.to_json()},
     )
@@ -75,30 +88,27 @@ def _run_ranks(
 
 def _run_rank(config_path: Path, overrides: list[str], json_path: Path | None) -> int:
     """Do this rank's part. What is wrong with the input is said once, by the first rank that finds something."""
-    from .pipeline import RENDER, ROLES, receive_job, run_pipelined, run_single
+    from .pipeline import RENDER, receive_job
     from .transport import Transport
 
     transport = Transport()
-    role = ROLES[transport.rank] if transport.rank < len(ROLES) else "idle"
-    record(rank=transport.rank, role=role, pid=os.getpid())
     config: RunConfig | None = None
     job: Job | None = None
-    single = by_messages = False
-    status, why = 0, ""
+    by_messages = False
+    status, why, role = 0, "", "starting"
     try:
+        config = load_config(config_path, overrides)
+        role = role_of(config.pipeline, transport.rank)
+        record(rank=transport.rank, role=role, pid=os.getpid())
         expected = int(os.environ.get(EXPECTED_RANKS, 0))
         if expected and expected != transport.size:
             raise InputError(
                 f"mpiexec: found a world of {transport.size} ranks, expected {expected}; "
                 f"it belongs to another MPI than mpi4py's ({transport.library})"
             )
-        config = load_config(config_path, overrides)
         transport.timeout_s = config.pipeline.timeout_s
-        single = config.pipeline.topology == "single"
-        needed = 1 if single else PIPELINED_RANKS
-        if transport.size < needed:
-            raise InputError(f"pipeline.topology: found {transport.size} ranks, expected {needed}: mpirun -n {needed}")
-        by_messages = not single and config.scene.delivery == "messages"
+        check_world(config.pipeline, transport.size)
+        by_messages = config.pipeline.topology != "single" and config.scene.delivery == "messages"
         if not (by_messages and transport.rank == RENDER):
             job = Job(config)
             if transport.rank == 0:
@@ -121,16 +131,13 @@ def _run_rank(config_path: Path, overrides: list[str], json_path: Path | None) -
         with FrameProgress(job.n_frames, on_terminal=transport.rank == 0) as progress:
 
             def show(doing: str, done: int) -> None:
-                record(doing=doing, done=done)
-                progress.show(doing, done)
+                if transport.rank == 0:
+                    record(doing=doing, done=done)
+                    progress.show(doing, done)
 
-            if single:
-                result = run_single(job, show) if transport.rank == 0 else None
-                transport.meet()
-            else:
-                result = run_pipelined(job, transport, show)
+            result = _run_topology(job, transport, show)
         if result is not None:
-            decision = _decided(single, transport.size)
+            decision = _decided(config.pipeline, transport.size)
             summary = _finish(job, decision, result | {"mpi": transport.library}, config_path, json_path)
             if EXPECTED_RANKS not in os.environ:
                 _tell(summary)
@@ -139,11 +146,38 @@ def _run_rank(config_path: Path, overrides: list[str], json_path: Path | None) -
     return 0
 
 
-def _decided(single: bool, ranks: int) -> Decision:
+def _run_topology(job: Job, transport: Transport, show: Callable[[str, int], None]) -> dict[str, Any] | None:
+    """Do this rank's part of the run's topology; the statistics of the run on rank 0, None elsewhere. Collective."""
+    topology = job.config.pipeline.topology
+    if topology == "single":
+        from .pipeline import run_single
+
+        result = run_single(job, show) if transport.rank == 0 else None
+        transport.meet()
+        return result
+    if topology not in EQUAL_RANKS:
+        from .pipeline import run_pipelined
+
+        return run_pipelined(job, transport, show)
+    ranks_here = transport.ranks_here()
+    if not job.config.render.threads:
+        job.threads = max(1, job.threads // ranks_here)
+    job.output.mkdir(parents=True, exist_ok=True)  # on a host of its own there may be no such folder yet
+    if topology == FRAME_PARALLEL:
+        from .frame_parallel import run_frame_parallel
+
+        return run_frame_parallel(job, transport, show)
+    from .sort_last import run_sort_last
+
+    return run_sort_last(job, transport, show)
+
+
+def _decided(pipeline: PipelineSection, ranks: int) -> Decision:
     """What the launcher decided; where there was none, what the person who started the ranks did."""
     if DECISION in os.environ:
         return Decision.from_json(os.environ[DECISION])
-    return Decision("single" if single else "pipelined", f"started on {ranks} ranks by mpiexec")
+    topology = "pipelined" if pipeline.topology == "auto" else pipeline.topology
+    return Decision(topology, f"started on {ranks} ranks by mpiexec")
 
 
 def _abort(transport: Any, role: str, error: BaseException) -> None:
@@ -152,6 +186,8 @@ def _abort(transport: Any, role: str, error: BaseException) -> None:
         import traceback
 
         traceback.print_exception(error)
+    if transport.failed(error):
+        time.sleep(MPIEXEC_ENDS_US_S)  # if a rank has died, mpiexec ends this one meanwhile, and the launcher says who
     cause = str(error) if isinstance(error, SplatpipeError) else f"{type(error).__name__}: {error}"
     status = getattr(error, "exit_status", 1)
     say_failed(f"rank {transport.rank} ({role}): {cause}", status)

@@ -103,10 +103,24 @@ class Transport:
         return bool(self._comm.Iprobe(source, int(kind)))
 
     def agree(self, status: int) -> list[int]:
-        """The status of every rank. Collective."""
+        """The status, or another small number, of every rank. Collective."""
         statuses = np.empty(self.size, np.int32)
         self._comm.Allgather(np.array([status], np.int32), statuses)
         return statuses.tolist()
+
+    def join(self, values: np.ndarray) -> np.ndarray:
+        """(sum of n,) float64: the (n,) values of every rank, end to end in the order of ranks. Collective."""
+        counts = self.agree(len(values))
+        joined = np.empty(sum(counts))
+        self._comm.Allgatherv(np.ascontiguousarray(values, np.float64), [joined, counts])
+        return joined
+
+    def ranks_here(self) -> int:
+        """How many ranks share this rank's host. Collective."""
+        here = self._comm.Split_type(self._mpi.COMM_TYPE_SHARED)
+        n = here.Get_size()
+        here.Free()
+        return n
 
     def bounce(self, peer: int, payload: np.ndarray, *, serve: bool) -> None:
         """Send an (n,) uint8 payload to a rank and take it back, or the other way round, with MPI's own blocking calls.
@@ -135,6 +149,10 @@ class Transport:
         for dest in list(self._under_way):
             self._drain(dest, 0)
         self.meet()
+
+    def failed(self, error: BaseException) -> bool:
+        """Whether an error is MPI's own, as when the rank at the other end has gone."""
+        return isinstance(error, self._mpi.Exception)
 
     def abort(self, status: int) -> None:
         """End every rank of the run with an exit status."""

@@ -23,9 +23,10 @@ SAMPLES = 16
 def cell_blocks(scene: Scene, octree: Octree) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """((b,) int64 first point, (b, 3) float64 origin, (b,) int32 cell) of the cells that own points, in stored order.
 
-    A cell's origin is that of the block it is stored in, so no coordinate changes.
+    A cell's origin is that of the block it is stored in, so no coordinate changes. Of a share of a scene: its cells.
     """
     owners = octree.owners
+    owners = owners[(octree.first_point[owners] >= 0) & (octree.first_point[owners] < scene.info.n_stored)]
     first_point = octree.first_point[owners]
     first, origin = scene.blocks()
     return first_point, origin[np.searchsorted(first, first_point, side="right") - 1], owners.astype(np.int32)

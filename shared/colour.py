@@ -109,9 +109,28 @@ class Colouring:
 
     def settled(self, scene: Scene) -> Colouring:
         """The same with its range of values found, so that other copies of the scene's points get the same colours."""
-        if self.mode not in _COLOUR_MAPPED or self.value_range is not None:
+        if not self.range_is_open:
             return self
-        return replace(self, value_range=_robust_range(_scalars(scene, self.mode), scene.info.n_stored))
+        return self.with_range_of(self.range_sample(scene, 0, scene.info.n_stored))
+
+    @property
+    def range_is_open(self) -> bool:
+        """Whether the range of values is to be found from the points."""
+        return self.mode in _COLOUR_MAPPED and self.value_range is None
+
+    def range_sample(self, scene: Scene, first: int, n: int) -> np.ndarray:
+        """(k,) float64: of the sample of n values that decides on the range, those of the points in ``scene``.
+
+        scene : all n points, or a share that begins at point ``first``. Samples of all shares, end to end, are that of
+        the whole scene.
+        """
+        index = _sample(n) - first
+        index = index[(index >= 0) & (index < scene.info.n_stored)]
+        return np.asarray(_scalars(scene, self.mode)(index), np.float64)
+
+    def with_range_of(self, sample: np.ndarray) -> Colouring:
+        """The same with the range of values that a sample shows."""
+        return replace(self, value_range=_robust_range(sample))
 
 
 def colour_words(scene: Scene, colouring: Colouring) -> np.ndarray:
@@ -136,7 +155,7 @@ def colour_words(scene: Scene, colouring: Colouring) -> np.ndarray:
             return _by_chunk(n, lambda part: _shade_words(normals[part], table, bare))
         case mode:
             values = _scalars(scene, mode)
-            low, high = colouring.value_range or _robust_range(values, n)
+            low, high = colouring.value_range or _robust_range(np.asarray(values(_sample(n)), np.float64))
             table = colormap_words(colouring.colormap)
             return _by_chunk(n, lambda part: map_scalars(values(part), low, high, table))
 
@@ -260,9 +279,8 @@ def _varies(scene: Scene, name: str) -> bool:
     return bool((values != values[0]).any())
 
 
-def _robust_range(values: Callable[[_Part], np.ndarray], n: int) -> tuple[float, float]:
-    """The 2nd and 98th percentile of a sample of the finite values; (0, 0) where there are none."""
-    sample = np.asarray(values(_sample(n)), np.float64)
+def _robust_range(sample: np.ndarray) -> tuple[float, float]:
+    """The 2nd and 98th percentile of the finite values of a sample; (0, 0) where there are none."""
     finite = sample[np.isfinite(sample)]
     if not len(finite):
         return 0.0, 0.0

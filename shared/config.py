@@ -126,7 +126,8 @@ class SplatSection(Section):
 class PipelineSection(Section):
     """``[pipeline]``."""
 
-    topology: Literal["auto", "single", "pipelined"] = "auto"
+    topology: Literal["auto", "single", "pipelined", "frame-parallel", "sort-last-only"] = "auto"
+    ranks: Annotated[int, Field(ge=0, le=65536)] = 0
     frames_in_flight: Annotated[int, Field(ge=1, le=64)] = 4
     timeout_s: Positive = 300.0
 

@@ -12,14 +12,16 @@ message            from → to                     payload
 ``SceneOffer``     sampling → render             ``scene.json`` and the colour mode
 ``SceneRequest``   render → sampling             array, first byte, number of bytes; nothing: no more is needed
 ``SceneBytes``     sampling → render             the bytes asked for, as they are stored
+``Framebuffer``    share → share                 words of pixels, by runs (``framebuffer_runs``)
 =================  ============================  ============================================================
 
-The last three cross before the first frame, where ``scene.delivery`` is ``messages``. Their header has the number of
+Those of scenes cross before the first frame, where ``scene.delivery`` is ``messages``. Their header has the number of
 the request in place of the frame's.
 
 Protocol versions
     1. The first.
     2. Scenes by messages.
+    3. Framebuffers.
 """
 
 from __future__ import annotations
@@ -36,7 +38,7 @@ from .errors import MessageError, StoreError
 from .scene_info import MAX_INFO_BYTES, SceneInfo, info_from_json
 
 MAGIC = b"SPLT"
-PROTOCOL_VERSION = 2
+PROTOCOL_VERSION = 3
 HEADER = struct.Struct("<4sHHQQ")
 _CAMERA = struct.Struct("<16d3d2Id")
 _SCENE_REQUEST = struct.Struct("<IIQ")
@@ -67,6 +69,7 @@ class Kind(IntEnum):
     SCENE_OFFER = 6
     SCENE_REQUEST = 7
     SCENE_BYTES = 8
+    FRAMEBUFFER = 9
 
 
 @dataclass(frozen=True)
@@ -147,7 +150,15 @@ class SceneBytes:
     data: np.ndarray
 
 
-Message = Camera | VisibilityBits | RenderPoints | SceneOffer | SceneRequest | SceneBytes
+@dataclass(frozen=True)
+class Framebuffer:
+    """What a rank has drawn of a frame. runs : (n,) uint8, by ``framebuffer_runs.encode_runs``."""
+
+    frame: int
+    runs: np.ndarray
+
+
+Message = Camera | VisibilityBits | RenderPoints | SceneOffer | SceneRequest | SceneBytes | Framebuffer
 
 
 def header(kind: Kind, frame: int, length: int) -> bytes:
@@ -199,6 +210,9 @@ def encode(message: Message) -> tuple[bytes, memoryview]:
         case SceneBytes():
             payload = np.ascontiguousarray(message.data).data
             return header(Kind.SCENE_BYTES, message.number, len(payload)), payload
+        case Framebuffer():
+            payload = np.ascontiguousarray(message.runs).data
+            return header(Kind.FRAMEBUFFER, message.frame, len(payload)), payload
 
 
 Bytes = bytes | bytearray | memoryview

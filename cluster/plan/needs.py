@@ -9,6 +9,7 @@ from typing import Any
 from ...shared.messages import FRAMEBUFFER_EMPTY, RENDER_POINT
 from ...shared.pooled import PoolCounts
 from ..job import Job
+from ..topologies import FRAME_PARALLEL, SORT_LAST_ONLY, ranks_to_start
 from .costs import COSTS
 from .part import (
     ADAPTIVE,
@@ -40,7 +41,7 @@ def parts(job: Job, work: Workload, decision: Decision) -> list[Part]:
     return [
         _mpi(decision),
         _delivery(job, decision),
-        _compositing(work),
+        _compositing(job, work, decision),
         _back_face_test(job, work),
         _level_of_detail(job, work),
         _render_point_stride(job, work),
@@ -100,8 +101,14 @@ def _delivery(job: Job, decision: Decision) -> Part:
     return Part(what, False, why, sent_mb, unit)
 
 
-def _compositing(work: Workload) -> Part:
+def _compositing(job: Job, work: Workload, decision: Decision) -> Part:
     sent = work.pixels * FRAMEBUFFER_EMPTY.nbytes
+    if decision.topology == SORT_LAST_ONLY:
+        others = ranks_to_start(job.config.pipeline, decision.topology) - 1
+        why = f"{others} ranks send rank 0 what they have drawn, at most this; background is not sent"
+        return Part("compositing", False, why, others * sent, "bytes/frame", "counted")
+    if decision.topology == FRAME_PARALLEL:
+        return Part("compositing", True, "a picture is drawn by one rank", sent, "bytes/frame", "counted")
     return Part("compositing", True, "one render rank: no framebuffer is sent", sent, "bytes/frame", "counted")
 
 

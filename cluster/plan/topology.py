@@ -16,10 +16,11 @@ from typing import Literal
 from ...shared.messages import RENDER_POINT
 from ..job import Job
 from ..launch import mpi_available
+from ..topologies import FRAME_PARALLEL, SORT_LAST_ONLY, ranks_to_start
 from .costs import COSTS, UnitCosts, compose_core_s, draw_core_s
 from .workload import Workload
 
-Topology = Literal["single", "pipelined"]
+Topology = Literal["single", "pipelined", "frame-parallel", "sort-last-only"]
 
 
 @dataclass(frozen=True)
@@ -112,10 +113,21 @@ def decide(job: Job) -> Decision:
     """
     wanted = job.config.pipeline.topology
     if wanted != "auto":
-        return Decision(wanted, f"pipeline.topology = {wanted!r}")
+        return Decision(wanted, f"pipeline.topology = {wanted!r}{_said(job, wanted)}")
     if not mpi_available():
         return Decision("single", "MPI is not installed: splatpipe[mpi]")
     return choose_topology(job, Workload.of_look(job))
+
+
+def _said(job: Job, topology: Topology) -> str:
+    """What a topology does with any number of ranks; nothing for the others."""
+    ranks = ranks_to_start(job.config.pipeline, topology)
+    if topology == FRAME_PARALLEL:
+        return f": each of {ranks} ranks opens the whole scene, and draws and writes whole pictures in turn"
+    if topology == SORT_LAST_ONLY:
+        share = job.scene.info.n_stored / ranks
+        return f": each of {ranks} ranks opens and draws about {share:,.0f} of the stored points; rank 0 composites"
+    return ""
 
 
 def _ms(seconds: float) -> str:
