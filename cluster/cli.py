@@ -30,6 +30,9 @@ bench_app = typer.Typer(help="Measure this machine: rasterizers and the builder,
 app.add_typer(bench_app, name="bench")
 app.add_typer(layer_app, name="layer")
 
+CellInputs = Annotated[
+    list[str] | None, typer.Argument(help="Scenes, point files, folders or globs; default: a generated surface.")
+]
 JsonOption = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write what was measured.")]
 
 
@@ -383,9 +386,7 @@ def bench_splats(
 
 @bench_app.command("codecs")
 def bench_codecs(
-    inputs: Annotated[
-        list[str] | None, typer.Argument(help="Scenes, point files, folders or globs; default: a generated surface.")
-    ] = None,
+    inputs: CellInputs = None,
     bits: Annotated[int, typer.Option(help="Of the grid in a cell, an axis.", min=1, max=16)] = 7,
     cells: Annotated[int, typer.Option(help="At most so many cells of each scene, evenly spread.", min=1)] = 64,
     leaves: Annotated[bool, typer.Option("--leaves", help="Leaves only, not every cell that owns points.")] = False,
@@ -436,9 +437,7 @@ def bench_codecs(
 
 @bench_app.command("budget")
 def bench_budget(
-    inputs: Annotated[
-        list[str] | None, typer.Argument(help="Scenes, point files, folders or globs; default: a generated surface.")
-    ] = None,
+    inputs: CellInputs = None,
     bits: Annotated[int, typer.Option(help="Of the grid in a cell, an axis.", min=1, max=8)] = 6,
     pools: Annotated[int, typer.Option(help="At most so many of a cell.", min=1, max=16)] = 2,
     cells: Annotated[int, typer.Option(help="At most so many leaves of each scene, evenly spread.", min=1)] = 1000,

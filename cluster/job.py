@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..nodes.culling import CullingNode
-from ..nodes.layer_sampling import LayerSamplingNode
 from ..nodes.picture.compose import Composer, Picture, PictureSettings
 from ..nodes.point_filter import PointFilter
 from ..nodes.raster import MAX_SIDE_PX, PointSize, Rasterizer, ResidentPoints, SplatSettings
@@ -21,10 +20,9 @@ from ..nodes.raster.gl_context import require_gl
 from ..nodes.render import RenderNode, Wanted, load_drawn, load_points
 from ..nodes.sampling import Pools, SamplingNode
 from ..shared.camera import Camera
-from ..shared.colour import Colouring, parse_colour
+from ..shared.colour import Colouring, colormap_words, parse_colour
 from ..shared.config import RunConfig
 from ..shared.errors import ConfigError
-from ..shared.layers.layer_store import open_layer
 from ..shared.messages import RenderPoints
 from ..shared.octree import Octree
 from ..shared.store import Scene
@@ -34,7 +32,9 @@ from .topologies import check_topology
 
 if TYPE_CHECKING:
     from ..nodes.layer_render import LayerRenderNode
+    from ..nodes.layer_sampling import LayerSamplingNode
     from ..nodes.raster.group_raster import ResidentGroups
+    from ..shared.layers.layer import Layer
 
 SPLAT_COLOUR = "#d0d0d0"
 """Colour of lit splats where points have none but the shading of their normals."""
@@ -56,11 +56,7 @@ class Job:
         check_topology(config)
         self.config = config
         self.threads = config.render.threads or len(os.sched_getaffinity(0))
-        self.layers = [open_layer(layer.path) for layer in config.layers]
-        if self.layers:
-            require_gl("layers are drawn with OpenGL")
-            if config.scene.delivery == "messages":
-                raise ConfigError("scene.delivery = 'messages': every rank opens the layers, expected 'files'")
+        self.layers = self._read_layers() if config.layers else []
         self.scene = scene or self._open_scene()
         info = self.scene.info
         self.n_pictures = config.output.frames
@@ -172,6 +168,18 @@ class Job:
             point_bytes=self.position_bytes + self.attribute_bytes,
         )
 
+    def _read_layers(self) -> list[Layer]:
+        from ..shared.layers.layer_store import open_layer
+
+        settings = self.config.layers
+        layers = [open_layer(layer.path) for layer in settings]
+        require_gl("layers are drawn with OpenGL")
+        if self.config.scene.delivery == "messages":
+            raise ConfigError("scene.delivery = 'messages': every rank opens the layers, expected 'files'")
+        for name in dict.fromkeys(layer.colormap for layer in settings):
+            colormap_words(name, "layers.colormap")
+        return layers
+
     def _open_scene(self) -> Scene:
         if self.config.scene.path:
             return Scene.open(Path(os.path.normpath(self.config.scene.path)))
@@ -185,6 +193,10 @@ class Job:
 
     def layer_nodes(self) -> list[tuple[CullingNode, LayerSamplingNode]]:
         """The culling and the sampling node of each layer of this run."""
+        if not self.layers:
+            return []
+        from ..nodes.layer_sampling import LayerSamplingNode
+
         return [
             (
                 CullingNode(layer.octree, backface=False, margin_px=1.0),

@@ -17,7 +17,6 @@ from rich.console import Console
 from ..shared.config import PipelineSection, RunConfig, load_config
 from ..shared.errors import ConfigError, InputError, SplatpipeError
 from ..shared.files import write_json
-from ..shared.layers.kinds import objects_of
 from .job import Job
 from .launch import EXPECTED_RANKS, inside_mpi, launch, mpi_available, record, say_failed
 from .plan.needs import left_out
@@ -230,6 +229,8 @@ def _tell(summary: dict[str, Any]) -> None:
         f"{summary['frames']} frames, {summary['frames_per_s']:.1f} frames/s, {summary['topology']}, "
         f"{summary['rasterizer']}; median {stages}"
     )
+    if summary["layers"]:
+        from ..shared.layers.kinds import objects_of
     for i, layer in enumerate(summary["layers"]):
         drawn = mean(of_layers[i] for of_layers in summary["per_frame"]["objects"])
         of = f"{layer['objects']:,} {objects_of(layer['kind'])}"

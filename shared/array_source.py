@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Protocol
 import numpy as np
 
 from .errors import StoreError
-from .scene_info import ArrayInfo, SceneInfo
+from .scene_info import SceneInfo
 
 _CHUNK = 1 << 22
 
@@ -68,30 +69,38 @@ class ArrayFiles:
         return self._path / f"{name}.npy"
 
     def _data_offset(self, name: str) -> int:
-        return _data_offset(self._file(name), self._info.arrays[name])
+        promised = self._info.arrays[name]
+        return data_offset(self._file(name), np.dtype(promised.dtype), promised.shape)
 
 
 @contextmanager
-def _reading(path: Path) -> Iterator[None]:
+def _reading(path: Path, whose: str = "scene") -> Iterator[None]:
     try:
         yield
     except FileNotFoundError:
-        raise StoreError(f"{path}: not found, expected an array of the scene") from None
+        raise StoreError(f"{path}: not found, expected an array of the {whose}") from None
     except (OSError, ValueError, SyntaxError) as error:
         raise StoreError(f"{path}: cannot be read: {error}") from error
 
 
-def _data_offset(path: Path, promised: ArrayInfo) -> int:
-    """Where the data of an array begin, after its header and the file's size were held against the promise."""
-    with _reading(path), path.open("rb") as file:
+def data_offset(path: Path, dtype: np.dtype, shape: tuple[int, ...], whose: str = "scene") -> int:
+    """Where the data of an ``.npy`` file begin, after its header and size were held against what is promised.
+
+    Raises StoreError naming what differs, or that an array of the ``whose`` is missing or cannot be read.
+    """
+    with _reading(path, whose), path.open("rb") as file:
         version = np.lib.format.read_magic(file)
         if version != (1, 0):
             raise StoreError(f"{path}: found npy version {version}, expected (1, 0)")
-        shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
+        found_shape, fortran, found = np.lib.format.read_array_header_1_0(file)
         offset = file.tell()
-    if (shape, fortran, dtype.str) != (promised.shape, False, promised.dtype):
-        raise StoreError(f"{path}: header says {dtype.str} {shape}, expected {promised.dtype} {promised.shape}")
-    size = path.stat().st_size
-    if size != offset + promised.bytes:
-        raise StoreError(f"{path}: found {size} bytes, expected {offset + promised.bytes}")
+    if (found_shape, fortran, found) != (shape, False, dtype):
+        raise StoreError(f"{path}: header says {_name(found)} {found_shape}, expected {_name(dtype)} {shape}")
+    size, expected = path.stat().st_size, offset + math.prod(shape) * dtype.itemsize
+    if size != expected:
+        raise StoreError(f"{path}: found {size} bytes, expected {expected}")
     return offset
+
+
+def _name(dtype: np.dtype) -> str:
+    return str(dtype) if dtype.names else dtype.str

@@ -48,7 +48,7 @@ CLASS_COLOURS = {
     18: "#ff4dff",  # high noise
 }
 """Colours of the ASPRS classes (LAS 1.4 R15, table 17)."""
-_OTHER_CLASS = "#00bcd4"  # 19–255: reserved and user-defined
+OTHER_CLASS = "#00bcd4"  # 19–255: reserved and user-defined
 _CLASS_CODES = [str(code) for code in range(256)]
 
 
@@ -305,15 +305,15 @@ def _class_colours(table: Mapping[str, str]) -> dict[int, str]:
 
 def _class_palette(colours: Mapping[int, str]) -> np.ndarray:
     """(256,) uint32 colour word of each class code."""
-    rgba = np.array([parse_colour(colours.get(code, _OTHER_CLASS), "class") for code in range(256)])
+    rgba = np.array([parse_colour(colours.get(code, OTHER_CLASS), "class") for code in range(256)])
     return rgba.view("<u4").ravel()
 
 
-def colormap_words(name: str) -> np.ndarray:
-    """(256,) uint32 words of a matplotlib colour map. Raises ConfigError with near names for an unknown one."""
+def colormap_words(name: str, key: str = "render.colormap") -> np.ndarray:
+    """(256,) uint32 words of a matplotlib colour map. Raises ConfigError naming ``key`` and near names for another."""
     from matplotlib import colormaps
 
     if name not in colormaps:
         near = ", ".join(difflib.get_close_matches(name, list(colormaps), n=3, cutoff=0.0))
-        raise ConfigError(f"render.colormap = {name!r}, expected a matplotlib colour map such as {near}")
+        raise ConfigError(f"{key} = {name!r}, expected a matplotlib colour map such as {near}")
     return np.ascontiguousarray(colormaps[name](np.linspace(0.0, 1.0, 256), bytes=True)).view("<u4").ravel()

@@ -106,7 +106,7 @@ def test_classes_have_the_colours_of_the_table(scene):
     rgba = unpack_rgb(words_of(scene, "classification"))
     codes = scene.attribute("classification")
     for code in np.unique(codes):
-        expected = colour.CLASS_COLOURS.get(code, colour._OTHER_CLASS)
+        expected = colour.CLASS_COLOURS.get(code, colour.OTHER_CLASS)
         found = {"#" + bytes(row[:3]).hex() for row in np.unique(rgba[codes == code], axis=0)}
         assert found == {expected}
     assert (rgba[:, 3] == 255).all()

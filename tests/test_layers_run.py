@@ -96,7 +96,7 @@ def test_a_run_without_layers_imports_neither_opengl_nor_layer_shaders(folder):
         "import sys; sys.argv = ['splatpipe', 'run', sys.argv[1], '--set', 'pipeline.topology=single']\n"
         "from splatpipe.cluster.cli import app\n"
         "app(standalone_mode=False)\n"
-        "print(sorted(m for m in sys.modules if m.startswith(('moderngl', 'splatpipe.nodes.layers'))))"
+        "print(sorted(m for m in sys.modules if m.startswith(('moderngl', 'splatpipe.nodes.layer', 'splatpipe.shared.layers.', 'splatpipe.shared.build'))))"
     )
     done = subprocess.run(
         [sys.executable, "-c", code, str(folder / "plain.toml")], capture_output=True, text=True, timeout=100

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from functools import partial
 from typing import Any
 
@@ -25,13 +25,11 @@ Draw = Callable[[], np.ndarray]
 """→ (height, width) uint64 framebuffer words, valid until the next call."""
 
 
-@contextmanager
 def points_frame(
     cells: Sequence[Cell], positions: Sequence[np.ndarray], orders: Sequence[np.ndarray], camera: Camera, compact: bool
-) -> Iterator[Draw]:
+) -> AbstractContextManager[Draw]:
     """From float32, or from fixed point: positions of each cell, relative to its cube, and which points they are."""
-    with resident_frame(resident(cells, positions, orders), camera, compact) as draw:
-        yield draw
+    return resident_frame(resident(cells, positions, orders), camera, compact)
 
 
 @contextmanager
@@ -50,13 +48,11 @@ def resident(cells: Sequence[Cell], positions: Sequence[np.ndarray], orders: Seq
     return ResidentPoints(x, y, z, colour, first, np.array([cell.lower for cell in cells]))
 
 
-@contextmanager
 def pools_frame(
     cells: Sequence[Cell], data: Sequence[np.ndarray], orders: Sequence[np.ndarray], camera: Camera, bits: int
-) -> Iterator[Draw]:
+) -> AbstractContextManager[Draw]:
     """From the bytes of ``codecs.streams``."""
-    with cell_pools_frame(list(map(partial(cell_of_pools, bits), cells, data, orders)), camera) as draw:
-        yield draw
+    return cell_pools_frame(list(map(partial(cell_of_pools, bits), cells, data, orders)), camera)
 
 
 def cell_of_pools(bits: int, cell: Cell, data: np.ndarray, order: np.ndarray) -> PoolCell:
@@ -73,13 +69,11 @@ def cell_pools_frame(cells: Sequence[PoolCell], camera: Camera) -> Iterator[Draw
         yield rasterizer.draw
 
 
-@contextmanager
 def groups_frame(
     cells: Sequence[Cell], data: Sequence[np.ndarray], orders: Sequence[np.ndarray], camera: Camera, bits: int
-) -> Iterator[Draw]:
+) -> AbstractContextManager[Draw]:
     """From the bytes of ``codecs.linear_groups``."""
-    with cell_groups_frame(list(map(partial(cell_of_groups, bits), cells, data, orders)), camera) as draw:
-        yield draw
+    return cell_groups_frame(list(map(partial(cell_of_groups, bits), cells, data, orders)), camera)
 
 
 def cell_of_groups(bits: int, cell: Cell, data: np.ndarray, order: np.ndarray) -> GroupCell:

@@ -8,22 +8,21 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ...shared.camera import Camera
-from ...shared.errors import DeviceError, InputError
 from ...shared.layers.layer import Layer
 from ...shared.messages import FRAMEBUFFER_EMPTY
-from ..raster.gl_context import check_errors, open_context
+from ..raster.gl_context import ContextOwner, check_errors
 
 if TYPE_CHECKING:
     from ...shared.layer_config import LayerSection
     from .gl_layer import Drawn
 
 
-class GlLayers:
+class GlLayers(ContextOwner):
     """Draws layers; a context manager that owns their OpenGL context.
 
     layers, settings : what to draw and how, one each.  width, height : of the frames, pixels.
@@ -39,44 +38,21 @@ class GlLayers:
 
         from .gl_kinds import gl_layer
 
-        self._context = open_context(device_index)
-        try:
-            self.device = str(self._context.info["GL_RENDERER"])
-            most = self._context.info["GL_MAX_TEXTURE_SIZE"]
-            if not (1 <= width <= most and 1 <= height <= most):
-                raise InputError(f"viewport: found {width}×{height}, expected 1…{most} px a side")
+        with self._set_up(device_index, width, height, "setting up layers"):
             self._image = np.full((height, width), FRAMEBUFFER_EMPTY)
             self._empty = self._image.copy()
             self._words = self._context.texture((width, height), 2, dtype="u4")
             depth = self._context.depth_texture((width, height))
             self._framebuffer = self._context.framebuffer([self._words], depth)
-            self._depth_only = self._context.framebuffer(
-                depth_attachment=depth
-            )  # clearing integer colours is undefined
+            # apart, because clearing integer colours is undefined
+            self._depth_only = self._context.framebuffer(depth_attachment=depth)
             self._context.enable_only(moderngl.DEPTH_TEST)
             self._layers: list[Drawn] = [
                 gl_layer(self._context, layer, setting) for layer, setting in zip(layers, settings, strict=True)
             ]
-            check_errors(self._context, "setting up layers")
-        except moderngl.Error as error:
-            self.close()
-            raise DeviceError(f"OpenGL: {' '.join(str(error).split())}") from error
-        except BaseException:
-            self.close()
-            raise
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def __len__(self) -> int:
         return len(self._layers)
-
-    def close(self) -> None:
-        """Release the context and with it all device memory."""
-        self._context.release()
 
     @property
     def resident_bytes(self) -> tuple[int, int]:

@@ -49,6 +49,7 @@ class GlCuboidInstances(GlCuboids):
         self._gradient = Gradient(self._context, self._settings, self._layer.objects["value"])
         records = self._context.buffer(self._layer.objects)
         template = self._context.buffer(np.hstack([CUBE_CORNER, CUBE_NORMAL]).astype("f4"))
+        self.static_bytes = template.size
         self._resident_bytes = records.size + template.size
         content = [(template, "3f4 3f4", "corner", "normal"), (records, f"{_RECORD} /i", *_NAMES)]
         self.vertices = self._context.vertex_array(self.program, content, mode=moderngl.TRIANGLE_STRIP)

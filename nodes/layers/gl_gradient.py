@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .gl_layer import colour_table, set_uniform
+from ...shared.colour import colormap_words
+from .gl_layer import set_uniform
 
 if TYPE_CHECKING:
     import moderngl
@@ -20,7 +21,7 @@ class Gradient:
     """The colour map of a layer on the device. Its range and filter are uniforms: changing them sends nothing else."""
 
     def __init__(self, context: moderngl.Context, settings: LayerSection, values: np.ndarray) -> None:
-        self._texture = context.texture((256, 1), 4, colour_table(settings.colormap).tobytes())
+        self._texture = context.texture((256, 1), 4, colormap_words(settings.colormap, "layers.colormap").tobytes())
         low, high = settings.value_range or (float(values.min()), float(values.max()))
         self.value_range = low, high
         self.value_filter = settings.value_filter or (-FLOAT_MAX, FLOAT_MAX)

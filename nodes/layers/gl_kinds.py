@@ -13,78 +13,70 @@ if TYPE_CHECKING:
     from ...shared.layers.layer import Layer
     from .gl_layer import Drawn
 
-TECHNIQUES = ("avc", "triangles", "strips", "instancing")
-
 
 def gl_layer(context: moderngl.Context, layer: Layer, settings: LayerSection) -> Drawn:
-    """The layer on the device. Raises ConfigError for a kind or technique that does not exist."""
-    technique = settings.technique
-    match layer.kind, technique:
-        case "arcs", "avc":
-            from .gl_arcs import GlArcs
+    """The layer on the device. Raises ConfigError for a kind that nothing draws."""
+    if settings.technique in ("triangles", "strips"):
+        return _mesh(context, layer, settings)
+    is_instanced = settings.technique == "instancing"
+    match layer.kind:
+        case "arcs":
+            from .gl_arcs import GlArcInstances, GlArcs
 
-            return GlArcs(context, layer, settings)
-        case "arcs", "instancing":
-            from .gl_arcs import GlArcInstances
+            drawn = GlArcInstances if is_instanced else GlArcs
+        case "blocks":
+            from .gl_blocks import GlBlockInstances, GlBlocks
 
-            return GlArcInstances(context, layer, settings)
-        case "arcs", "triangles" | "strips":
-            from .expand_arcs import strips
-            from .gl_mesh import GlMesh
-            from .mesh import separate
+            drawn = GlBlockInstances if is_instanced else GlBlocks
+        case "cuboids":
+            from .gl_cuboids import GlCuboidInstances, GlCuboids
 
-            mesh = strips(layer, settings.arcs.segments)
-            return GlMesh(context, layer, settings, separate(mesh) if technique == "triangles" else mesh)
-        case "blocks", "avc":
-            from .gl_blocks import GlBlocks
+            drawn = GlCuboidInstances if is_instanced else GlCuboids
+        case "polygons":
+            from .gl_polygons import GlPolygonInstances, GlPolygons
 
-            return GlBlocks(context, layer, settings)
-        case "blocks", "instancing":
-            from .gl_blocks import GlBlockInstances
-
-            return GlBlockInstances(context, layer, settings)
-        case "blocks", "triangles" | "strips":
-            from .expand_blocks import strips
-            from .gl_blocks import GlBlockMesh
-            from .mesh import separate
-
-            mesh = strips(layer)
-            return GlBlockMesh(context, layer, settings, separate(mesh) if technique == "triangles" else mesh)
-        case "cuboids", "avc":
-            from .gl_cuboids import GlCuboids
-
-            return GlCuboids(context, layer, settings)
-        case "cuboids", "instancing":
-            from .gl_cuboids import GlCuboidInstances
-
-            return GlCuboidInstances(context, layer, settings)
-        case "cuboids", "triangles" | "strips":
-            from .expand_cuboids import strips
-            from .gl_mesh import GlMesh
-            from .mesh import separate
-
-            mesh = strips(layer)
-            return GlMesh(context, layer, settings, separate(mesh) if technique == "triangles" else mesh)
-        case "polygons", "avc":
-            from .gl_polygons import GlPolygons
-
-            return GlPolygons(context, layer, settings)
-        case "polygons", "instancing":
-            from .gl_polygons import GlPolygonInstances
-
-            return GlPolygonInstances(context, layer, settings)
-        case "polygons", "triangles" | "strips":
-            from . import expand_polygons
-            from .gl_mesh import GlMesh
-
-            expand = expand_polygons.triangles if technique == "triangles" else expand_polygons.strips
-            return GlMesh(context, layer, settings, expand(layer))
-        case "trajectories", "avc" | "instancing":
+            drawn = GlPolygonInstances if is_instanced else GlPolygons
+        case "trajectories":
             from .gl_trajectories import GlTrajectories
 
-            return GlTrajectories(context, layer, settings)
-        case "trajectories", "triangles" | "strips":
+            drawn = GlTrajectories
+        case _:
+            raise _not_drawn(layer)
+    return drawn(context, layer, settings)
+
+
+def _mesh(context: moderngl.Context, layer: Layer, settings: LayerSection) -> Drawn:
+    """The baselines that keep geometry on the device."""
+    from .gl_mesh import GlMesh
+    from .mesh import for_technique
+
+    technique = settings.technique
+    match layer.kind:
+        case "arcs":
+            from .expand_arcs import strips
+
+            mesh = for_technique(strips(layer, settings.arcs.segments), technique)
+        case "blocks":
+            from .expand_blocks import strips
+            from .gl_blocks import GlBlockMesh
+
+            return GlBlockMesh(context, layer, settings, for_technique(strips(layer), technique))
+        case "cuboids":
+            from .expand_cuboids import strips
+
+            mesh = for_technique(strips(layer), technique)
+        case "polygons":
+            from . import expand_polygons
+
+            mesh = (expand_polygons.strips if technique == "strips" else expand_polygons.triangles)(layer)
+        case "trajectories":
             from .gl_trajectories import trajectory_mesh
 
             return trajectory_mesh(context, layer, settings)
-    raise ConfigError(f"layer {layer.name}: technique {technique!r} of {layer.kind}: not found")
+        case _:
+            raise _not_drawn(layer)
+    return GlMesh(context, layer, settings, mesh)
+
+
+def _not_drawn(layer: Layer) -> ConfigError:
+    return ConfigError(f"layer {layer.name}: found kind {layer.kind!r}, which nothing draws")

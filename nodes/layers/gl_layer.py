@@ -148,10 +148,3 @@ def layer_shader(*names: str, defines: tuple[str, ...] = ()) -> str:
     folder = files(str(__package__)) / "shaders"
     lines = ["#version 450", *(f"#define {name}" for name in defines)]
     return "\n".join(lines + [(folder / f"{name}.glsl").read_text(encoding="utf-8") for name in names])
-
-
-def colour_table(colormap: str) -> np.ndarray:
-    """(256,) uint32 colour words of a matplotlib colour map, as of ``shared.colour``. Raises ConfigError."""
-    from ...shared.colour import colormap_words
-
-    return colormap_words(colormap)

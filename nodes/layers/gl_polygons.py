@@ -97,6 +97,7 @@ class GlPolygonInstances(GlPolygons):
         )
         records = self._send()
         template = self._context.buffer(TEMPLATE)
+        self.static_bytes = template.size
         self._resident_bytes += template.size
         content = [(template, "2i4", "corner"), (records, "2f4 2f4 1u4 /i", "position", "apex", "owner")]
         self.vertices = self._context.vertex_array(self.program, content, mode=moderngl.TRIANGLES)

@@ -21,7 +21,7 @@ from .expand_trajectories import (
 from .gl_gradient import Gradient
 from .gl_layer import VARYINGS, GlLayer, commands, layer_shader, set_uniform
 from .gl_mesh import GlMesh
-from .mesh import separate
+from .mesh import for_technique
 
 if TYPE_CHECKING:
     import moderngl
@@ -116,16 +116,19 @@ class _Part(GlLayer):
         return layer_shader(*before, *names, defines=self._defines)
 
 
-class _Lines(_Part):
-    """A line a segment."""
+class _Segments(_Part):
+    """Something a segment; shader files of what is made of it, and of its fragments."""
+
+    _geometry: tuple[str, ...]
+    _fragment: str
 
     def _prepare(self) -> None:
         import moderngl
 
         self.program = self._context.program(
             vertex_shader=self._vertex_shader(),
-            geometry_shader=self._geometry_shader("output", "emit", "trajectory_lines.geom"),
-            fragment_shader=layer_shader("word", "line.frag"),
+            geometry_shader=self._geometry_shader(*self._geometry),
+            fragment_shader=layer_shader("word", self._fragment),
             varyings=VARYINGS,
         )
         self.vertices = self._context.vertex_array(
@@ -138,33 +141,21 @@ class _Lines(_Part):
     def _commands(self, offset: np.ndarray, count: np.ndarray) -> np.ndarray:
         first, n = self._segments(offset, count)
         return commands(4 * first, 4 * n)
+
+
+class _Lines(_Segments):
+    """A line a segment."""
+
+    _geometry, _fragment = ("output", "emit", "trajectory_lines.geom"), "line.frag"
 
     def is_wanted(self) -> bool:
         return self._shared.style.style in ("auto", "lines")
 
 
-class _Tubes(_Part):
+class _Tubes(_Segments):
     """A tube a segment."""
 
-    def _prepare(self) -> None:
-        import moderngl
-
-        self.program = self._context.program(
-            vertex_shader=self._vertex_shader(),
-            geometry_shader=self._geometry_shader("tube", "output", "emit", "trajectory_tubes.geom"),
-            fragment_shader=layer_shader("word", "surface.frag"),
-            varyings=VARYINGS,
-        )
-        self.vertices = self._context.vertex_array(
-            self.program,
-            [(self._shared.records, _RECORD, *_NAMES)],
-            index_buffer=self._shared.index,
-            mode=moderngl.LINES_ADJACENCY,
-        )
-
-    def _commands(self, offset: np.ndarray, count: np.ndarray) -> np.ndarray:
-        first, n = self._segments(offset, count)
-        return commands(4 * first, 4 * n)
+    _geometry, _fragment = ("tube", "output", "emit", "trajectory_tubes.geom"), "surface.frag"
 
     def is_wanted(self) -> bool:
         return self._shared.style.style in ("auto", "tubes") or self._shared.has_highlights
@@ -287,4 +278,4 @@ def trajectory_mesh(context: moderngl.Context, layer: Layer, settings: LayerSect
     mesh, of_nodes = strips(layer, settings.trajectories), values(layer, settings.trajectories)
     ends = settings.value_range or (float(of_nodes.min()), float(of_nodes.max()))
     settings = settings.model_copy(update={"value_range": ends})
-    return GlMesh(context, layer, settings, separate(mesh) if settings.technique == "triangles" else mesh)
+    return GlMesh(context, layer, settings, for_technique(mesh, settings.technique))

@@ -67,6 +67,11 @@ def cube_strips(lower: np.ndarray, upper: np.ndarray, value: np.ndarray) -> Mesh
     )
 
 
+def for_technique(strips: Mesh, technique: str) -> Mesh:
+    """Strips as they are for technique ``strips``, else their triangles."""
+    return strips if technique == "strips" else separate(strips)
+
+
 def separate(strips: Mesh) -> Mesh:
     """The triangles of strips one by one: each vertex has the normal of its triangle where that is flat."""
     assert strips.first_strip_vertex is not None

@@ -11,19 +11,17 @@ import numpy as np
 
 from .expand_arcs import CLOSED, DEFAULT_SEGMENTS, whole_root
 from .expand_trajectories import CAP, HIDDEN, Look, Templates, segments
+from .gl_blocks import BLOCK_VERTEX
+from .gl_mesh import VERTEX
+from .gl_polygons import RECORD as POLYGON_RECORD
+from .gl_trajectories import RECORD as NODE_RECORD
 
 if TYPE_CHECKING:
     from ...shared.layer_config import LayerSection, TrajectoryStyle
     from ...shared.layers.layer import Layer
 
-VERTEX_BYTES = 28
-"""Of a mesh: position, normal, value, all float32."""
-BLOCK_VERTEX_BYTES = 40
-"""Of blocks: position, normal, place in the block, type."""
-POLYGON_ELEMENT_BYTES = 20
-"""Position, apex, number of the object."""
-NODE_BYTES, SEGMENT_BYTES, SELECTION_BYTES = 28, 16, 4
-"""Of trajectories: place, motion and number; four elements; a bit a trajectory, in words."""
+SEGMENT_BYTES, SELECTION_BYTES = 16, 4
+"""Of trajectories: four elements; a bit a trajectory, in words."""
 
 
 def layer_bytes(layer: Layer, settings: LayerSection, technique: str) -> int:
@@ -31,14 +29,14 @@ def layer_bytes(layer: Layer, settings: LayerSection, technique: str) -> int:
     if technique in ("avc", "instancing"):
         match layer.kind:
             case "polygons":  # one element more, for the last one's next
-                return layer.objects.nbytes + POLYGON_ELEMENT_BYTES * (len(layer.elements) + 1)
+                return layer.objects.nbytes + POLYGON_RECORD.itemsize * (len(layer.elements) + 1)
             case "trajectories":
                 words = len(layer.parameters["names"]) // 32 + 1
                 n_segments = len(segments(layer).index)
-                return NODE_BYTES * len(layer.elements) + SEGMENT_BYTES * n_segments + SELECTION_BYTES * words
+                return NODE_RECORD.itemsize * len(layer.elements) + SEGMENT_BYTES * n_segments + SELECTION_BYTES * words
         return layer.objects.nbytes
-    vertex_bytes = BLOCK_VERTEX_BYTES if layer.kind == "blocks" else VERTEX_BYTES
-    return vertex_bytes * _vertices(layer, settings, as_strips=technique == "strips")
+    vertex = BLOCK_VERTEX if layer.kind == "blocks" else VERTEX
+    return vertex.itemsize * _vertices(layer, settings, as_strips=technique == "strips")
 
 
 def _vertices(layer: Layer, settings: LayerSection, *, as_strips: bool) -> int:

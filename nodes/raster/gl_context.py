@@ -9,12 +9,14 @@ import ctypes
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from importlib.resources import files
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
-from ...shared.errors import DeviceError
+from ...shared.errors import DeviceError, InputError
 
 if TYPE_CHECKING:
     import moderngl
@@ -74,6 +76,47 @@ def open_context(device_index: int) -> moderngl.Context:
     except Exception as error:  # the binding raises bare Exception
         index = os.environ.get("GLCONTEXT_DEVICE_INDEX", device_index)
         raise DeviceError(f"OpenGL: no OpenGL 4.5 on EGL device {index}: {error}") from error
+
+
+class ContextOwner:
+    """Owns an OpenGL context that draws frames of one size; a context manager, to be used from one thread."""
+
+    device: str
+    _context: moderngl.Context
+
+    @contextmanager
+    def _set_up(self, device_index: int, width: int, height: int, doing: str) -> Iterator[None]:
+        """Open the context; around what makes everything in it. Where that fails, nothing of it is left.
+
+        Raises DeviceError: no OpenGL 4.5, or an error of OpenGL; InputError: a viewport that is empty or above the
+        texture size.
+        """
+        import moderngl
+
+        self._context = open_context(device_index)
+        try:
+            self.device = str(self._context.info["GL_RENDERER"])
+            most = self._context.info["GL_MAX_TEXTURE_SIZE"]
+            if not (1 <= width <= most and 1 <= height <= most):
+                raise InputError(f"viewport: found {width}×{height}, expected 1…{most} px a side")
+            yield
+            check_errors(self._context, doing)
+        except moderngl.Error as error:
+            self.close()
+            raise DeviceError(f"OpenGL: {' '.join(str(error).split())}") from error
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Release the context and with it all device memory. May be called twice."""
+        self._context.release()
 
 
 def storage_limit(context: moderngl.Context) -> int:

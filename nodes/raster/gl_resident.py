@@ -9,14 +9,14 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ...shared.camera import Camera
-from ...shared.errors import DeviceError, InputError
+from ...shared.errors import DeviceError
 from . import ResidentPoints, check_viewport
-from .gl_context import check_errors, open_context, storage_limit
+from .gl_context import ContextOwner, check_errors, storage_limit
 from .pieces import split_entries
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ class Batch:
     n_units: int
 
 
-class GlResident(ABC):
+class GlResident(ContextOwner, ABC):
     """An OpenGL rasterizer: context, chunks of the point-array, block matrices, runs.
 
     points : copied to the device; its columns may be released or unmapped afterwards.
@@ -88,38 +88,14 @@ class GlResident(ABC):
         device_index: int,
         borders: np.ndarray | None = None,
     ) -> None:
-        import moderngl
-
         self._n_points = len(points)
         self._shape = (height, width)
         self._block_origin = points.block_origin
-        self._context = open_context(device_index)
-        try:
-            self.device = str(self._context.info["GL_RENDERER"])
+        with self._set_up(device_index, width, height, "setting up"):
             self._limit = storage_limit(self._context)
-            most = self._context.info["GL_MAX_TEXTURE_SIZE"]
-            if not (1 <= width <= most and 1 <= height <= most):
-                raise InputError(f"viewport: found {width}×{height}, expected 1…{most} px a side")
             self._most_groups = self._context.info["GL_MAX_COMPUTE_WORK_GROUP_COUNT"][0]
             self._upload(points.block_first_point, columns, borders)
             self._prepare()
-            check_errors(self._context, "setting up")
-        except moderngl.Error as error:
-            self.close()
-            raise DeviceError(f"OpenGL: {' '.join(str(error).split())}") from error
-        except BaseException:
-            self.close()
-            raise
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Release the context and with it all device memory. May be called twice."""
-        self._context.release()
 
     @property
     def resident_bytes(self) -> int:

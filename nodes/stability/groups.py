@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...shared.camera import Camera, look_at, perspective_camera
 from ...shared.codecs.linear_groups import LinearGroupCodec
 from ...shared.messages import FRAMEBUFFER_EMPTY
 from ...shared.stability.case import cases, expect
@@ -14,25 +13,17 @@ from ..raster.groups import GroupCells, group_cell, group_cells
 from ..raster.groups_reference import project_groups
 from ..raster.reference import reference_frame
 from .chain import every_point
+from .encoded_views import BOUNDS, VIEWS, camera_on
 from .matrices import MATRICES, SEEN, through
 
-_VIEWS = {
-    "cell of 1e-9": (1e-9, 0.0, (0.5, -2.0, 1.5)),
-    "cell of 1e9": (1e9, 0.0, (0.5, -2.0, 1.5)),
-    "6.4e6 m away": (1.0, 6.4e6, (0.5, -2.0, 1.5)),
-    "seen along the sheet": (1.0, 0.0, (0.5, -2.0, 0.5001)),
-    "eye among the points": (1.0, 0.0, (0.5, 0.1, 0.6)),
-}
-_BOUNDS = dict.fromkeys(_VIEWS, 0.01) | {"eye among the points": 0.05}
 
-
-@cases("linear groups/image position", bounds=_BOUNDS, unit="px")
+@cases("linear groups/image position", bounds=BOUNDS, unit="px")
 def image_position(name: str) -> float:
     """Image position of points whose ends were projected and that were interpolated, in float32 as the kernel rounds,
     against float64; 1920×1080.
     """
-    edge, shift, eye = _VIEWS[name]
-    groups, camera = _sheet(edge, shift), _camera(edge, shift, eye)
+    edge, shift, eye = VIEWS[name]
+    groups, camera = _sheet(edge, shift), camera_on(edge, shift, eye)
     points = _without_positions(groups)
     index = np.arange(len(points))
     exact_u, exact_v, w = project_groups(groups)(points, camera, index)
@@ -47,7 +38,7 @@ def drawn_matrix(name: str) -> float:
     """Pixels of a frame from linear groups that differ from the NumPy twin's, the camera's matrix stretched, flattened,
     without depth, or too large for float32.
     """
-    groups, camera = _sheet(1.0, 0.0), through(_camera(1.0, 0.0, (0.5, -2.0, 1.5)), name)
+    groups, camera = _sheet(1.0, 0.0), through(camera_on(1.0, 0.0, (0.5, -2.0, 1.5)), name)
     points = _without_positions(groups)
     held = ResidentGroups(groups, np.array([0, len(points)]))
     with CpuGroupRasterizer(held, camera.width, camera.height, threads=1) as rasterizer:
@@ -73,9 +64,3 @@ def _without_positions(groups: GroupCells) -> ResidentPoints:
     """What stands for the points where their projection says where they are; all of one colour."""
     none = np.zeros(len(groups.x) + len(groups.parameter), np.uint32)
     return ResidentPoints(none, none, none, none, np.zeros(1, np.int64), np.zeros((1, 3)))
-
-
-def _camera(edge: float, shift: float, eye: tuple[float, float, float]) -> Camera:
-    up, target = np.array([0.0, 0.0, 1.0]), np.full(3, 0.5)
-    pose = look_at(np.array(eye) * edge + shift, target * edge + shift, up)
-    return perspective_camera(frame=0, world_from_camera=pose, fov_y_rad=0.9, width=1920, height=1080, near=0.01 * edge)

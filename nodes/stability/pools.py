@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...shared.camera import Camera, look_at, perspective_camera
 from ...shared.codecs import streams
 from ...shared.messages import FRAMEBUFFER_EMPTY, RENDER_POINT
 from ...shared.stability.case import cases, expect
@@ -14,18 +13,10 @@ from ..raster.pools import PoolCell, pool_cells
 from ..raster.pools_reference import decoded, project_pools
 from ..raster.reference import project, reference_frame
 from .chain import every_point
+from .encoded_views import BOUNDS, VIEWS, camera_on
 from .matrices import MATRICES, SEEN, through
 
 _BITS = 7
-
-_VIEWS = {
-    "cell of 1e-9": (1e-9, 0.0, (0.5, -2.0, 1.5)),
-    "cell of 1e9": (1e9, 0.0, (0.5, -2.0, 1.5)),
-    "6.4e6 m away": (1.0, 6.4e6, (0.5, -2.0, 1.5)),
-    "seen along the sheet": (1.0, 0.0, (0.5, -2.0, 0.5001)),
-    "eye among the points": (1.0, 0.0, (0.5, 0.1, 0.6)),
-}
-_BOUNDS = dict.fromkeys(_VIEWS, 0.01) | {"eye among the points": 0.05}
 
 
 def _sheet(edge: float, shift: float) -> PoolCell:
@@ -39,19 +30,13 @@ def _sheet(edge: float, shift: float) -> PoolCell:
     return PoolCell(points, np.full(3, shift), edge / 2**_BITS, np.arange(256, dtype=np.uint32), colour)
 
 
-def _camera(edge: float, shift: float, eye: tuple[float, float, float]) -> Camera:
-    up, target = np.array([0.0, 0.0, 1.0]), np.full(3, 0.5)
-    pose = look_at(np.array(eye) * edge + shift, target * edge + shift, up)
-    return perspective_camera(frame=0, world_from_camera=pose, fov_y_rad=0.9, width=1920, height=1080, near=0.01 * edge)
-
-
-@cases("pools/image position", bounds=_BOUNDS, unit="px")
+@cases("pools/image position", bounds=BOUNDS, unit="px")
 def image_position(name: str) -> float:
     """Image position of points that are sums of a transformed vertex and translation, in float32 as the kernel rounds,
     against float64; 1920×1080.
     """
-    edge, shift, eye = _VIEWS[name]
-    cell, camera = _sheet(edge, shift), _camera(edge, shift, eye)
+    edge, shift, eye = VIEWS[name]
+    cell, camera = _sheet(edge, shift), camera_on(edge, shift, eye)
     points, index = decoded([cell]), np.arange(len(cell.points))
     u, v, _ = project_pools([cell])(points, camera, index)
     exact_u, exact_v, w = project(points, camera, index)
@@ -65,7 +50,7 @@ def matrix(name: str) -> float:
     """Pixels of a frame from pools that differ from the NumPy twin's, the camera's matrix stretched, flattened, without
     depth, or too large for float32.
     """
-    cell, camera = _sheet(1.0, 0.0), through(_camera(1.0, 0.0, (0.5, -2.0, 1.5)), name)
+    cell, camera = _sheet(1.0, 0.0), through(camera_on(1.0, 0.0, (0.5, -2.0, 1.5)), name)
     none = np.empty(0, np.float32)
     held = ResidentPoints(
         none, none, none, np.empty(0, np.uint32), np.zeros(1, np.int64), np.zeros((1, 3)), pools=pool_cells([cell])

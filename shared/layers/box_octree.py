@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..build.morton import root_cube, spread_bits
+from ..build.morton import morton_keys, root_cube
+from ..build.partition import Cells
+from ..build.subtree import link
 from ..octree import Octree
 
 CAPACITY = 256
@@ -31,9 +33,8 @@ def box_octree(lower: np.ndarray, upper: np.ndarray, capacity: int = CAPACITY) -
     # what rounding puts on a border is held by both its sides
     low, high = np.maximum(low - 1, 0), np.minimum(high + 1, last)
     deepest = _LEVELS - np.frexp((low ^ high).max(axis=1).astype(np.float64))[1]
-    code = np.zeros(len(low), np.int64)
-    for axis in range(3):
-        code |= _spread(low[:, axis]) << axis
+    code = np.empty(len(low), np.int64)
+    morton_keys(low.astype(np.float64), np.zeros(3), 1.0, 0, len(low), code)
     level = np.zeros(len(low), np.int64)
     for at in range(_LEVELS):
         here = np.flatnonzero(level == at)
@@ -47,39 +48,30 @@ def box_octree(lower: np.ndarray, upper: np.ndarray, capacity: int = CAPACITY) -
     return _linked(level[order], code[order], origin, edge), order
 
 
-def _spread(values: np.ndarray) -> np.ndarray:
-    return np.array([spread_bits(v) for v in np.unique(values)], np.int64)[np.unique(values, return_inverse=True)[1]]
-
-
 def _linked(level: np.ndarray, code: np.ndarray, origin: np.ndarray, edge: float) -> Octree:
     """The octree of objects that stand by level and code."""
     codes = [np.empty(0, np.int64)] * (int(level[-1]) + 2)
     for at in range(int(level[-1]), -1, -1):
         codes[at] = np.unique(np.concatenate([code[level == at], codes[at + 1] >> 3]))
     codes.pop()
-    sizes = [len(c) for c in codes]
-    start = np.cumsum([0, *sizes])
-    n = int(start[-1])
-    cell_level = np.repeat(np.arange(len(codes)), sizes)
-    parent = np.full(n, -1, np.int32)
-    own = np.zeros(n, np.int64)
-    for at, here in enumerate(codes):
-        cells = slice(start[at], start[at + 1])
-        if at:
-            parent[cells] = start[at - 1] + np.searchsorted(codes[at - 1], here >> 3)
-        own[cells] = np.bincount(np.searchsorted(here, code[level == at]), minlength=len(here))
+    levels = np.repeat(np.arange(len(codes)), [len(c) for c in codes]).astype(np.uint8)
+    own = np.concatenate(
+        [np.bincount(np.searchsorted(c, code[level == at]), minlength=len(c)) for at, c in enumerate(codes)]
+    )
+    none = np.zeros(len(levels), np.int64)
+    cells, _ = link(Cells(levels, np.concatenate(codes), none, own, none.astype(bool)))  # in this order already
     below = own.copy()
-    for cell in range(n - 1, 0, -1):
-        below[parent[cell]] += below[cell]
-    n_children = np.bincount(parent[1:], minlength=n).astype(np.uint8)
+    for at in range(len(codes) - 1, 0, -1):
+        here = np.flatnonzero(levels == at)
+        np.add.at(below, cells.parent[here], below[here])
     return Octree(
         origin=origin,
         edge=edge,
-        level=cell_level.astype(np.uint8),
-        code=np.concatenate(codes).astype(np.uint64),
-        parent=parent,
-        first_child=np.where(n_children > 0, 1 + np.cumsum(n_children) - n_children, -1).astype(np.int32),
-        n_children=n_children,
+        level=cells.level,
+        code=cells.code.astype(np.uint64),
+        parent=cells.parent,
+        first_child=cells.first_child,
+        n_children=cells.n_children,
         first_point=np.cumsum(own) - own,
         n_points=own,
         n_below=below,

@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from ..array_source import data_offset
 from ..errors import InputError, StoreError
 from ..files import disk_error
 from .kinds import KINDS
@@ -138,22 +139,8 @@ def _are_arrays(value: Any) -> bool:
 
 def _load(path: Path, dtype: np.dtype, promised: dict[str, int]) -> np.ndarray:
     """An array that is what ``layer.json`` promises: header and size are held against it before anything is read."""
-    try:
-        with path.open("rb") as file:
-            version = np.lib.format.read_magic(file)
-            if version != (1, 0):
-                raise StoreError(f"{path}: found npy version {version}, expected (1, 0)")
-            shape, _, found = np.lib.format.read_array_header_1_0(file)
-            if (shape, found) != ((promised["n"],), dtype):
-                raise StoreError(f"{path}: header says {found} {shape}, expected {dtype} ({promised['n']},)")
-            size, expected = path.stat().st_size, file.tell() + promised["n"] * dtype.itemsize
-            if size != expected:
-                raise StoreError(f"{path}: found {size} bytes, expected {expected}")
-            array = np.fromfile(file, dtype, promised["n"])
-    except FileNotFoundError:
-        raise StoreError(f"{path}: not found, expected an array of the layer") from None
-    except (OSError, ValueError, SyntaxError) as error:
-        raise StoreError(f"{path}: cannot be read: {error}") from error
+    offset = data_offset(path, dtype, (promised["n"],), "layer")
+    array = np.fromfile(path, dtype, promised["n"], offset=offset)
     if _crc(array) != promised["crc32"]:
         raise StoreError(f"{path}: checksum {_crc(array):08x}, expected {promised['crc32']:08x}: the file is damaged")
     return array

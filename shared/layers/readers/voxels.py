@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from ...codecs.palette import to_palette
-from ...colour import CLASS_COLOURS
+from ...colour import CLASS_COLOURS, OTHER_CLASS
 from ...errors import InputError
 from ...points import pack_rgb, unpack_rgb
 from ...readers.source import Source
@@ -17,7 +17,6 @@ from ..layer import Layer, simple_layer
 COLOUR_BY = ("rgb", "classification", "height")
 _BATCH = 1 << 20
 _HEIGHTS = 64
-_OTHER_CLASS = "#00bcd4"
 
 
 def voxelised(source: Source, name: str, block_size: float, colour_by: str = "auto") -> Layer:
@@ -110,7 +109,7 @@ def _types(colour_by: str, cells: np.ndarray, sums: np.ndarray) -> tuple[np.ndar
         return types, [f"#{r:02x}{g:02x}{b:02x}" for r, g, b in unpack_rgb(palette)[:, :3].tolist()]
     if colour_by == "classification":
         codes, types = np.unique(cells[:, 3], return_inverse=True)
-        return types, [CLASS_COLOURS.get(int(code), _OTHER_CLASS) for code in codes]
+        return types, [CLASS_COLOURS.get(int(code), OTHER_CLASS) for code in codes]
     from matplotlib import colormaps
     from matplotlib.colors import to_hex
 
