@@ -9,6 +9,15 @@ readers/           files of points → batches
 synth/             a synthetic city scan → batches
 octree             the sequential octree: flat breadth-first arrays
 store, scene_info  the scene directory: plain ``.npy`` arrays and ``scene.json``
+array_source       where the arrays come from: files, or another rank
+scene_share,       a rank's share of a scene; a scene without points
+empty_scene
+coded_positions,   positions in the form of a codec; the order of points in a set
+set_order
+pooled             pooled forms of cells
+codecs/            how else a cell can hold its positions
+layers/            objects besides points
+framebuffer_runs   framebuffer words as they cross between ranks
 build/, rebuild    batches → scene (partition, level-of-detail sets, external), and again
 camera             cameras
 camera_path,       orbit, keyframes, explicit poses

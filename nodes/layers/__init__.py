@@ -11,7 +11,8 @@ module                  content
 ``gl_layer``            what all kinds share: records on the device, draw commands, camera
 ``gl_cuboids`` …        the techniques of a kind
 ``mesh``                triangles and strips of objects, in NumPy: what shaders are held against
-``sizes``               what a layer takes on the device, by technique
 ``expand_cuboids`` …    the same, of a kind
+``sizes``               what a layer takes on the device, by technique
+``stages``              what each stage of a technique is given
 ======================  ==================================================================================
 """

@@ -9,6 +9,9 @@ module                  content
 ``kinds``               the kinds by name
 ``cuboids`` …           the record of each kind, what it may hold, and where its objects lie
 ``outlines``            outlines of any sort → fans, of which polygons consist
+``motion``              speed and acceleration of tracks
+``hierarchy``           trees with sizes → treemap, sunburst
+``readers``             files → layers
 ======================  ==================================================================================
 
 Layers lie in world axes, heights along +z. Positions are float32 relative to the layer's origin, which is float64: they
