@@ -6,7 +6,7 @@ import pytest
 from rich.console import Console
 from splatpipe.cluster.bench.raster import ONE_PIXEL, SHUFFLED_BATCHES, bench_raster, print_raster
 from splatpipe.cluster.bench.roofline import bench_roofline, print_roofline
-from splatpipe.nodes.raster import gl_resident
+from splatpipe.nodes.raster import gl_context
 from splatpipe.nodes.raster.gl_context import gl_available
 from splatpipe.shared.errors import DeviceError
 
@@ -51,7 +51,7 @@ def test_what_cannot_run_is_left_out_with_its_reason(monkeypatch, capsys):
     def no_driver(_device_index):
         raise DeviceError("OpenGL: no driver here")
 
-    monkeypatch.setattr(gl_resident, "open_context", no_driver)
+    monkeypatch.setattr(gl_context, "open_context", no_driver)
     results = bench_raster(2_000, size=16, repeats=3, rasterizers=("gl", "cpu"))
     assert results["omitted"] == [{"rasterizer": "gl", "reason": "OpenGL: no driver here"}]
     assert {row["rasterizer"] for row in results["rows"]} == {"cpu"}
