@@ -9,7 +9,7 @@ import sys
 import numpy as np
 import pytest
 from splatpipe.shared.build import BuildSettings, build_scene, builder, runs
-from splatpipe.shared.build.settings import MemoryPlan
+from splatpipe.shared.build.settings import MemoryPlan, resident_bytes
 from splatpipe.shared.errors import InputError
 from splatpipe.shared.points import pack_normals
 from splatpipe.shared.readers import open_source
@@ -127,7 +127,7 @@ def test_count_of_the_header_is_not_needed(tmp_path, monkeypatch, n_points):
 def test_header_that_promises_a_trillion_points_allocates_nothing_for_them(tmp_path):
     source = ArraySource(np.zeros((10, 3)), n_points=10**12)
     with pytest.raises(InputError, match="found 10 points, expected the 1000000000000"):
-        build_scene([source], tmp_path / "s", settings=BuildSettings(memory_bytes=1 << 30))
+        build_scene([source], tmp_path / "s", settings=BuildSettings(memory_bytes=resident_bytes() + (1 << 30)))
     assert not list(tmp_path.iterdir())
 
 
