@@ -113,7 +113,7 @@ def test_the_record_says_where_time_and_bytes_went(config, tmp_path):
     assert json.loads(copy.read_text()) == run
     assert [rank["role"] for rank in run["ranks"]] == ["culling", "sampling", "render"]
     assert set(run["stages"]) == {"culling", "sampling", "render"}
-    assert run["messages"]["CAMERA"]["count"] == 6
+    assert run["messages"]["FRAME_START"]["count"] == 6
     cells = run["scene"]["cells"]
     assert run["messages"]["VISIBILITY"] == {"count": 3, "bytes": 3 * (24 + (cells + 7) // 8)}
     assert run["messages"]["RENDER_POINTS"]["count"] == 3
