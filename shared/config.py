@@ -144,6 +144,7 @@ class PipelineSection(Section):
     sampling_ranks: Ranks = 0
     render_ranks: Ranks = 0
     render_split: Literal["tiles", "shares"] = "tiles"
+    balance: Literal["off", "measured"] = "off"
     frames_in_flight: Annotated[int, Field(ge=1, le=64)] = 4
     timeout_s: Positive = 300.0
 

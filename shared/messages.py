@@ -22,7 +22,7 @@ Protocol versions
     1. The first.
     2. Scenes by messages.
     3. Framebuffers.
-    4. Frames start by a plan.
+    4. Frames start by a plan; notes of plans and of stage times.
 """
 
 from __future__ import annotations
@@ -73,6 +73,7 @@ class Kind(IntEnum):
     SCENE_BYTES = 8
     FRAMEBUFFER = 9
     PLAN = 10
+    STAGE_TIMES = 11
 
 
 @dataclass(frozen=True)

@@ -39,5 +39,5 @@ class Tiles:
                 raise MessageError(f"framebuffer of rank {rank}: found frame {received.frame}, expected frame {frame}")
             tile = np.full(window.n_pixels, FRAMEBUFFER_EMPTY)
             merge_runs(received.payload, tile)
-            window.of(self._whole)[:] = tile.reshape(window.y1 - window.y0, -1)
+            window.of(self._whole)[:] = tile.reshape(window.y1 - window.y0, window.x1 - window.x0)
         return self._whole
