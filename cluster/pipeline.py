@@ -98,16 +98,17 @@ def run_layout(job: Job, layout: Layout, transport: Transport, progress: Progres
     loop = FrameLoop(job, layout, transport, progress)
     drawn = loop.run()
     told = _told(layout, drawn, transport)
+    if can_balance(layout):
+        told |= {"taken_s": loop.taken_s(), "adopting_s": loop.adopting_s}
     result = None
     if transport.rank == 0:
         others = [rank for rank in layout.workers if rank]
         all_told = [told, *(transport.receive_note(rank, Kind.STATISTICS)[1] for rank in others)]
         result = _merged(drawn, all_told)
-        if can_balance(layout):
+        if can_balance(layout) and len(job.frames):
             from .balance.summary import balance_record
 
-            work_s = {of["rank"]["rank"]: of["work_s"] for of in all_told}
-            result["balance"] = balance_record(layout, work_s, loop.balancer)
+            result["balance"] = balance_record(layout, all_told, loop.balancer)
     elif transport.rank in layout.workers:
         transport.send_note(0, Kind.STATISTICS, len(job.frames), told)
     transport.finish()
@@ -151,7 +152,7 @@ class FrameLoop:
         self._plan = Plan(-1, (), (), ())
         self._culling: CullingPart | None = None
         self._sampling: SamplingPart | None = None
-        self._adopting_s: list[float] = []
+        self.adopting_s: list[float] = []
         self._balances = is_on(job.config.pipeline, layout)
         self.balancer: Balancer | None = None
 
@@ -235,7 +236,7 @@ class FrameLoop:
                 self._make_parts(self._lane, plan)
             for part in filter(None, (self._culling, self._sampling)):
                 part.look_through(self._layout, self._lane, plan)
-        self._adopting_s.append(time.perf_counter() - begun)
+        self.adopting_s.append(time.perf_counter() - begun)
 
     def _make_parts(self, lane: int, plan: Plan) -> None:
         ranks, cells = self._layout.lanes[lane], self._lanes[lane]
@@ -254,6 +255,7 @@ class FrameLoop:
         transport, layout = self._transport, self._layout
         assert transport
         cells = [lane.dealt for lane in self._lanes]
+        by_processor = self._job.rasterizer == "cpu"
         rank_0_selects = layout.lanes[0].stages_of(0) != ["render"]
         if self._rank == 0:
             if not rank_0_selects:
@@ -261,14 +263,23 @@ class FrameLoop:
                 self._plan = with_borders(self._plan, layout, cells)
             policies = make_policies(layout, cells, self._job.views.width, self._job.views.height)
             self.balancer = Balancer(layout, transport, policies, self._job.frames)
-            return TimesTeller(self._clocks, self._adopting_s, self.balancer.hear)
+            return TimesTeller(self._clocks, by_processor, self.adopting_s, self.balancer.hear)
         if not rank_0_selects and self._rank == layout.lanes[0].culling[0]:
             send_cells(cells, transport)
 
         def tell(times: StageTimes) -> None:
             transport.send_note(0, Kind.STAGE_TIMES, times.first, times.to_note())
 
-        return TimesTeller(self._clocks, self._adopting_s, tell)
+        return TimesTeller(self._clocks, by_processor, self.adopting_s, tell)
+
+    def taken_s(self) -> dict[str, list[float]]:
+        """By stage, seconds of each frame as load is balanced by."""
+        from .balance import BUSY_STAGES
+        from .balance.times import taken
+
+        by_processor = self._job.rasterizer == "cpu"
+        clocks = (self._clocks[stage] for stage in BUSY_STAGES)
+        return {clock.stage: taken(clock, by_processor).tolist() for clock in clocks if clock.work_s}
 
     def _open_render(self, stack: ExitStack) -> RenderStage | None:
         """The render stage of this rank, on its share of the points; None for a rank that draws nothing."""

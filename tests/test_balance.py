@@ -72,7 +72,7 @@ def simulated(layout, policies, plan, seconds_of, n_frames, rng, noise):
     return plans, balance
 
 
-@settings(max_examples=20, deadline=None, derandomize=True)
+@settings(max_examples=12, deadline=None, derandomize=True)
 @given(
     st.integers(2, 8),
     st.floats(0, WIDTH),
@@ -95,12 +95,12 @@ def test_tiles_come_to_rest_with_even_work_wherever_it_is(n, x, y, spread_px, ba
     before, after = (
         imbalance(np.array([of["render"] for of in seconds_of(plan, 0).values()])) for plan in (even, plans[-1])
     )
-    assert after <= min(1.3, max(before, 1.15)), (before, after, len(balance.changes))
-    assert sum(a is not b for a, b in pairwise(plans[200:])) <= (5 if noise else 1), "it comes to rest"
+    assert after <= max(1.15, min(before, 1.25)), (before, after, len(balance.changes))
+    assert sum(a is not b for a, b in pairwise(plans[200:])) <= (10 if noise else 1), "it comes to rest"
     assert_fills(plans[-1].windows)
 
 
-@settings(max_examples=20, deadline=None, derandomize=True)
+@settings(max_examples=12, deadline=None, derandomize=True)
 @given(
     st.integers(2, 6),
     st.integers(16, 60),
@@ -133,8 +133,8 @@ def test_subtrees_come_to_rest_with_even_work_whoever_has_it(n, s, noise, seed, 
     plans, _ = simulated(layout, policies, first, seconds_of, 400, rng, noise)
     best = imbalance(of_parts(balanced_borders(work, n)))
     found = imbalance(of_parts(plans[-1].culling[0]))
-    assert found <= 1.3 * best, (found, best, imbalance(of_parts(first.culling[0])))
-    assert sum(a is not b for a, b in pairwise(plans[200:])) <= (10 if noise else 2), "it comes to rest"
+    assert found <= 1.25 * best, (found, best, imbalance(of_parts(first.culling[0])))
+    assert sum(a is not b for a, b in pairwise(plans[200:])) <= (16 if noise else 2), "it comes to rest"
 
 
 def test_work_that_moves_is_followed():
@@ -290,14 +290,17 @@ def test_what_can_be_balanced(layout, expected):
 def test_times_survive_their_note():
     clocks = {stage: StageClock(stage) for stage in ("culling", "sampling", "render", "picture", "compositing")}
     told = []
-    teller = TimesTeller(clocks, [0.5, 0.25], told.append)
+    teller = TimesTeller(clocks, True, [0.5, 0.25], told.append)
     for i in range(2 * FRAMES_A_NOTE + 3):
         clocks["render"].work_s.append(float(i))
+        clocks["render"].cpu_s.append(i + 1.0 if i % 2 else i - 0.5)
         teller.done(i)
     assert [of.first for of in told] == [0, FRAMES_A_NOTE]
     back = StageTimes.from_note(json.loads(json.dumps(told[1].to_note())), 3)
     assert (back.first, back.adopting_s, list(back.seconds)) == (FRAMES_A_NOTE, 0.25, ["render"])
-    assert back.seconds["render"].tolist() == list(range(FRAMES_A_NOTE, 2 * FRAMES_A_NOTE))
+    assert back.seconds["render"].tolist() == [
+        i if i % 2 else i - 0.5 for i in range(FRAMES_A_NOTE, 2 * FRAMES_A_NOTE)
+    ], "what waits for a core does not work"
 
 
 @pytest.mark.parametrize(
@@ -408,7 +411,7 @@ def test_measured_times_move_borders_and_the_record_says_so(config, alone, tmp_p
         def done(self, i):
             for stage, clock in self._clocks.items():
                 if clock.work_s:
-                    clock.work_s[-1] = 0.01 if stage in ("culling", "render") else 1e-3
+                    clock.work_s[-1] = clock.cpu_s[-1] = 0.01 if stage in ("culling", "render") else 1e-3
             super().done(i)
 
     class Unheard(Balancer):
@@ -421,13 +424,13 @@ def test_measured_times_move_borders_and_the_record_says_so(config, alone, tmp_p
     together, record, world = on_threads(
         config, tmp_path / "many", "hybrid", 6, *HYBRID, "output.frames=40", "pipeline.frames_in_flight=1"
     )
-    assert {name: together[name] for name in alone if name == "frame_0000.png"}
+    assert together["frame_0000.png"] == alone["frame_0000.png"]
     balance = record["balance"]
     assert {change["moved"] for change in balance["changes"]} == {"culling", "tiles"}
-    assert world.sent["STAGE_TIMES"] == 5 * 5, "a note in eight frames"
+    assert world.sent["STAGE_TIMES"] == 5 * (40 // FRAMES_A_NOTE)
     assert world.sent["PLAN"] % 5 == 0
     first = next(change for change in balance["changes"] if change["moved"] == "culling")
-    assert first["frame"] == 8
+    assert first["frame"] == FRAMES_A_NOTE
     assert first["before"] != first["after"]
     assert first["after"][0][1] > first["before"][0][1]
     assert first["imbalance"] == pytest.approx(5 / 3)
@@ -464,4 +467,4 @@ def test_another_plan_for_every_frame_between_processes(config, alone, tmp_path,
     assert pictures(out) == alone
     record = json.loads((out / "run.json").read_text())
     assert record["messages"]["PLAN"]["count"] == 12 * (ranks - 1)
-    assert record["messages"]["STAGE_TIMES"]["count"] == ranks - 1
+    assert record["messages"]["STAGE_TIMES"]["count"] == (ranks - 1) * (12 // FRAMES_A_NOTE)

@@ -18,8 +18,10 @@ from ...shared.octree_parts import balanced_borders
 from ..layout import Lane, Plan
 from . import Seconds
 
-LEAST_FORGOTTEN = 0.02
+LEAST_FORGOTTEN = 0.01
 """Share of what was learned that gives way to the even spread at each measurement, at least: nothing is ruled out."""
+NOISE = 0.1
+"""Share of their sum by which times of the same parts may differ where the view has not changed."""
 Selecting = Literal["culling", "sampling"]
 
 
@@ -60,7 +62,7 @@ def forgotten(thought: np.ndarray, measured: np.ndarray, same: bool) -> float:
     """
     total = float(measured.sum())
     changed = float(np.abs(measured - thought).sum()) / total if same and total > 0 else 0.0
-    return min(max(changed, LEAST_FORGOTTEN), 1.0)
+    return min(changed, 1.0) if changed > NOISE else LEAST_FORGOTTEN
 
 
 def learned(

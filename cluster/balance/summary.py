@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from ..layout import Layout
-from . import BUSY_STAGES
 from .balancer import Balancer, make_policies
 from .hysteresis import imbalance
 
@@ -16,36 +15,40 @@ ENDS = 16
 """Frames at the beginning and at the end of a run that are looked at apart."""
 
 
-def balance_record(
-    layout: Layout, work_s: Mapping[int, Mapping[str, Sequence[float]]], balancer: Balancer | None
-) -> dict[str, Any]:
+def balance_record(layout: Layout, told: Sequence[Mapping[str, Any]], balancer: Balancer | None) -> dict[str, Any]:
     """JSON-able.
 
-    work_s : by rank and stage, seconds of each frame.  balancer : of the run; None where it was not balanced.
-    ``busy_s`` is the work of each rank; ``slowest_s`` that of the slowest rank, frame by frame: on a core of its own
-    for each rank a frame takes at least this. ``imbalance`` is the slowest part over the mean of all, in medians of
-    frames.
+    told : of each rank, ``taken_s`` by stage, seconds of each frame as they are balanced by, and ``adopting_s`` of each
+    plan, the first included.  balancer : of the run; None where it was not balanced.
+
+    ``busy_s`` is the work of each rank; ``slowest_s`` that of the slowest rank, frame by frame: what a frame takes at
+    least where each rank has cores of its own. ``imbalance`` is the slowest part over the mean of all: of the medians
+    of the first and the last frames, and the median of that of ``each`` frame. ``adopting_ms`` is what the slowest rank
+    took for a change of plan, in the median.
     """
-    ranks = layout.workers
-    busy = {rank: np.sum([work_s[rank][s] for s in BUSY_STAGES if s in work_s[rank]], axis=0) for rank in ranks}
-    n = max(len(of) for of in busy.values())
+    taken_s = {of["rank"]["rank"]: of["taken_s"] for of in told}
+    busy = np.array([np.sum(list(of.values()), axis=0) for of in taken_s.values()])
+    n = busy.shape[1]
     uneven = {}
     for policy in make_policies(layout, [np.ones(1)] * len(layout.lanes), 1, 1):  # for their parts alone
+        each = [imbalance(policy.parts(_medians(taken_s, slice(i, i + 1)))) for i in range(n)]
         uneven[policy.name] = {
-            name: imbalance(policy.parts(_medians(work_s, frames)))
-            for name, frames in (("first", slice(0, ENDS)), ("last", slice(-ENDS, None)), ("all", slice(0, n)))
+            "first": imbalance(policy.parts(_medians(taken_s, slice(0, ENDS)))),
+            "last": imbalance(policy.parts(_medians(taken_s, slice(-ENDS, None)))),
+            "each": float(np.median(each)),
         }
+    adopted = np.array([of["adopting_s"] for of in told])[:, 1:]
     return {
         "policy": "measured" if balancer else "off",
-        "busy_s": [float(busy[rank].sum()) for rank in ranks],
-        "slowest_s": np.max(list(busy.values()), axis=0).tolist(),
+        "busy_s": busy.sum(axis=1).tolist(),
+        "slowest_s": busy.max(axis=0).tolist(),
         "imbalance": uneven,
+        "adopting_ms": 1e3 * float(np.median(adopted.max(axis=0))) if adopted.size else None,
         "changes": balancer.changes if balancer else [],
     }
 
 
-def _medians(work_s: Mapping[int, Mapping[str, Sequence[float]]], frames: slice) -> dict[int, dict[str, float]]:
+def _medians(taken_s: Mapping[int, Mapping[str, Sequence[float]]], frames: slice) -> dict[int, dict[str, float]]:
     return {
-        rank: {stage: float(np.median(values[frames])) for stage, values in of.items() if stage in BUSY_STAGES}
-        for rank, of in work_s.items()
+        rank: {stage: float(np.median(values[frames])) for stage, values in of.items()} for rank, of in taken_s.items()
     }

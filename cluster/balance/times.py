@@ -1,6 +1,9 @@
 """Stage times on their way to rank 0: a note of some frames at a time, so that messages are few.
 
 Nobody waits for a note. Rank 0 takes those that have come when it starts frames.
+
+Where the processor draws, a stage takes no longer than its processor time: a rank that waits for a core, because there
+are more ranks than cores, has no more work for that. What a GPU draws is timed by the clock.
 """
 
 from __future__ import annotations
@@ -15,7 +18,7 @@ from ...shared.errors import MessageError
 from ..record import StageClock
 from . import BUSY_STAGES
 
-FRAMES_A_NOTE = 8
+FRAMES_A_NOTE = 4
 """Frames of a note: enough for a median, few enough to follow a camera."""
 
 
@@ -52,22 +55,33 @@ class StageTimes:
         return cls(first, seconds, adopting_s)
 
 
+def taken(clock: StageClock, by_processor: bool, first: int = 0) -> np.ndarray:
+    """(n,) seconds of the frames of a stage from the ``first`` on."""
+    work = np.array(clock.work_s[first:])
+    return np.minimum(work, clock.cpu_s[first:]) if by_processor else work
+
+
 class TimesTeller:
     """Tells of a rank's clocks, whenever there are frames for a note.
 
+    by_processor : as of ``taken``.
     adopting_s : seconds of each plan that the rank adopted so far, which it adds to.
     """
 
     def __init__(
-        self, clocks: Mapping[str, StageClock], adopting_s: Sequence[float], tell: Callable[[StageTimes], None]
+        self,
+        clocks: Mapping[str, StageClock],
+        by_processor: bool,
+        adopting_s: Sequence[float],
+        tell: Callable[[StageTimes], None],
     ) -> None:
-        self._clocks, self._adopting_s, self._tell = clocks, adopting_s, tell
+        self._clocks, self._by_processor, self._adopting_s, self._tell = clocks, by_processor, adopting_s, tell
 
     def done(self, i: int) -> None:
         """Take note that the frame at position ``i`` is done."""
         first = i + 1 - FRAMES_A_NOTE
         if (i + 1) % FRAMES_A_NOTE:
             return
-        worked = {stage: self._clocks[stage].work_s[first:] for stage in BUSY_STAGES}
-        seconds = {stage: np.array(values) for stage, values in worked.items() if len(values)}
+        found = {stage: taken(self._clocks[stage], self._by_processor, first) for stage in BUSY_STAGES}
+        seconds = {stage: values for stage, values in found.items() if len(values)}
         self._tell(StageTimes(first, seconds, self._adopting_s[-1]))
