@@ -38,9 +38,10 @@ from .compositing import Assembler, make_assembler
 from .delivery import receive_scene, serve_scene
 from .job import Job, RenderStage
 from .layout import ALONE, Layout, Plan
-from .record import FrameCounts, StageClock, rank_record, spread_ms
+from .record import FrameCounts, StageClock, rank_record, spread_ms, summed_traffic
 from .selection import CullingPart, LaneCells, SamplingPart, first_plan, merged_entries, shares_of
 from .transport import Transport
+from .wall import writes_screens
 
 STAGES = ("culling", "sampling", "render", "compositing", "picture")
 CULLING, SAMPLING, RENDER = range(3)
@@ -230,9 +231,12 @@ class FrameLoop:
         if not self._renders:
             return None
         self._assembler: Assembler | None = None
-        if self._transport and len(self._layout.render) > 1:
+        screen = job.wall.screens[number] if job.wall and writes_screens(job, self._layout) else None
+        self._waits_for_screens = self._transport if screen else None
+        if self._transport and len(self._layout.render) > 1 and not screen:
             self._assembler = make_assembler(job.config.pipeline, self._layout, self._transport)
-        return stack.enter_context(job.open_render(self._progress, share, shown=self._shows))
+        shown = self._shows or screen is not None
+        return stack.enter_context(job.open_render(self._progress, share, shown=shown, screen=screen))
 
     def _warm_up_selection(self) -> None:
         """Compile what selecting needs, or load what was compiled."""
@@ -299,7 +303,7 @@ class FrameLoop:
             of_layers = [self._take_entries(layout.lanes[0].sampling[0], len(layer.octree)) for layer in layers]
         with clock.working():
             words = render.rasterize(camera, merged_entries(camera.frame, received))
-            picture = render.compose(camera, words, of_layers) if not self._assembler and self._shows else None
+            picture = None if self._assembler else render.compose(camera, words, of_layers)
         if self._assembler:
             with self._clocks["compositing"].working():
                 whole = self._assembler.assemble(camera.frame, words, self._plan.windows)
@@ -308,7 +312,18 @@ class FrameLoop:
                     picture = render.compose(camera, whole, of_layers)
         with clock.waiting():
             render.show(camera.frame, picture)
+            if self._waits_for_screens:
+                self._meet_screens(self._waits_for_screens, camera.frame)
         self._counts.add_layers(of_layers)
+
+    def _meet_screens(self, transport: Transport, frame: int) -> None:
+        """On the display rank: wait for every other screen's part of a frame, so that it is done when all are."""
+        display, *others = self._layout.render
+        if self._rank != display:
+            transport.send_note(display, Kind.FRAME_DONE, frame)
+            return
+        for rank in others:
+            transport.receive_note(rank, Kind.FRAME_DONE)
 
     # --- between stages ----------------------------------------------------------------------------------------------
 
@@ -410,12 +425,8 @@ def _merged(drawn: Drawn, told: Sequence[dict[str, Any]]) -> dict[str, Any]:
     for of in told:
         for name, values in of["counts"].items():
             counts[name] = np.add(counts[name], values).tolist() if name in counts else values
-    messages: dict[str, dict[str, int]] = {}
-    for of in told:
-        for kind, count in of["messages"].items():
-            sums = messages.setdefault(kind, dict.fromkeys(count, 0))
-            messages[kind] = {unit: sums[unit] + n for unit, n in count.items()}
-    times = {name: values for of in told for name, values in of["times"].items()}
+    names = dict.fromkeys(name for of in told for name in of["times"])
+    times = {name: [s for of in told for s in of["times"].get(name, [])] for name in names}
     rasterizer = next(of["rasterizer"] for of in told if of["rasterizer"])
     per_frame = {f"{clock.stage}_s": clock.work_s for clock in clocks} | counts | times
     return drawn.record() | {
@@ -423,5 +434,5 @@ def _merged(drawn: Drawn, told: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "stages": {clock.stage: clock.summary() for clock in clocks},
         "per_frame": per_frame,
         "ranks": [of["rank"] for of in told],
-        "messages": messages,
+        "messages": summed_traffic(of["messages"] for of in told),
     }

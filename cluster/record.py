@@ -7,7 +7,7 @@ import platform
 import resource
 import subprocess
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -84,6 +84,17 @@ def spread_ms(seconds: list[float]) -> dict[str, float]:
     values = np.asarray(seconds) * 1e3
     names = ("median", "min", "p95", "max")
     return dict(zip(names, (float(v) for v in np.percentile(values, [50, 0, 95, 100])), strict=True))
+
+
+def summed_traffic(of_ranks: Iterable[Mapping[str, Mapping[str, int]]]) -> dict[str, dict[str, int]]:
+    """Messages and bytes that ranks have sent together, by kind."""
+    sums: dict[str, dict[str, int]] = {}
+    for traffic in of_ranks:
+        for kind, counts in traffic.items():
+            of_kind = sums.setdefault(kind, {})
+            for unit, n in counts.items():
+                of_kind[unit] = of_kind.get(unit, 0) + n
+    return sums
 
 
 def rank_record(role: str, rank: int) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from ..shared.scene_share import clip_entries, share_borders
 from ..shared.windows import Window, tiles
 from .job import Job
 from .layout import Lane, Layout, Plan
+from .wall import screen_windows
 
 SUBTREES_PER_RANK = 16
 """Least subtrees for each rank that they are dealt to: enough for even parts, few enough for few shared ancestors."""
@@ -64,13 +65,14 @@ def shares_of(layout: Layout, whole: Octree) -> list[tuple[int, int]]:
 
 
 def first_plan(job: Job, layout: Layout, lanes: Sequence[LaneCells]) -> Plan:
-    """The plan to begin with: even cells, even tiles.
+    """The plan to begin with: even cells, even tiles, or the screens of a wall.
 
     lanes : none on a rank that selects nothing, which need not know who does.
     """
     windows: list[Window] = []
     if layout.split == "tiles":
-        windows = tiles(job.views.width, job.views.height, [1.0] * len(layout.render))
+        windows = screen_windows(job, layout)
+        windows = windows or tiles(job.views.width, job.views.height, [1.0] * len(layout.render))
     return Plan(
         0,
         tuple(cells.borders(cells.parts[0]) for cells in lanes),

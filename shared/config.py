@@ -73,6 +73,17 @@ class CameraSection(Section):
     poses: list[Matrix] = Field(default=[])
 
 
+class WallSection(Section):
+    """``[wall]``."""
+
+    columns: Annotated[int, Field(ge=1, le=256)] = 1
+    rows: Annotated[int, Field(ge=1, le=256)] = 1
+    mullion_x_px: Annotated[int, Field(ge=0, le=4096)] = 0
+    mullion_y_px: Annotated[int, Field(ge=0, le=4096)] = 0
+    output: Literal["assembled", "tiles"] = "assembled"
+    mullion_colour: str = "#000000"
+
+
 class FilterSection(Section):
     """``[filter]``."""
 
@@ -166,6 +177,7 @@ class RunConfig(Section):
 
     scene: SceneSection = SceneSection()
     camera: CameraSection = CameraSection()
+    wall: WallSection = WallSection()
     filter: FilterSection = FilterSection()
     culling: CullingSection = CullingSection()
     sampling: SamplingSection = SamplingSection()

@@ -1,5 +1,5 @@
 """Tiles: every render rank sends the words of its window, background left out, and the display rank lays them side by
-side. Where a rank drew nothing in its window, a head is all that crosses.
+side. Where a rank drew nothing in its window, a head is all that crosses. What is in no window stays background.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Tiles:
             self._transport.send(self._ranks[0], Framebuffer(frame, runs))
             return None
         if self._whole.shape != words.shape:
-            self._whole = np.empty_like(words)
+            self._whole = np.full_like(words, FRAMEBUFFER_EMPTY)
         windows[0].of(self._whole)[:] = windows[0].of(words)
         for rank, window in zip(self._ranks[1:], windows[1:], strict=True):
             received = self._transport.receive(rank, Kind.FRAMEBUFFER, most_bytes(window.n_pixels))
