@@ -70,7 +70,7 @@ def test_pictures_are_encoded_in_their_order_whoever_has_drawn_them(n_pictures, 
     pictures = [range(rank, n_pictures, n_ranks) for rank in range(n_ranks)]
     for rank in range(1, n_ranks):
         for number in pictures[rank]:
-            SentFilm(wire.of(rank), [number]).put(picture(number))  # pyright: ignore[reportArgumentType]
+            SentFilm(wire.of(rank), [number]).put(picture(number))
     film = gathered(wire, pictures)
     for number in pictures[0]:
         film.put(picture(number))
@@ -105,4 +105,4 @@ def test_a_run_that_failed_waits_for_no_picture():
 
 
 def gathered(wire: Wire, pictures) -> GatheredFilm:
-    return GatheredFilm(Path("film.mp4"), 30.0, wire, pictures, WIDTH, HEIGHT)  # pyright: ignore[reportArgumentType]
+    return GatheredFilm(Path("film.mp4"), 30.0, wire, pictures, WIDTH, HEIGHT)
