@@ -94,7 +94,7 @@ def test_a_share_of_the_points_on_each_rank_gives_the_bits_of_one_rank(config, s
         held = [rank["points"] for rank in run["ranks"]]
         assert sum(held) == Scene.open(scenes / order).info.n_stored
         assert max(held) - min(held) <= 2 * max(300, 2048), "balanced up to a cell"
-        assert run["messages"]["FRAMEBUFFER"]["count"] == 5 * (n - 1)
+        assert run["messages"].get("FRAMEBUFFER", {"count": 0})["count"] == 5 * (n - 1)
         assert all(rank["rss_bytes"] > 1e6 for rank in run["ranks"])
 
 
@@ -142,7 +142,7 @@ def test_the_world_of_mpirun_is_taken_or_refused_in_one_line(config, tmp_path, t
 
 @needs_mpi
 @pytest.mark.mpi
-@pytest.mark.parametrize(("topology", "role"), [("frame-parallel", "pictures"), ("sort-last-only", "share")])
+@pytest.mark.parametrize(("topology", "role"), [("frame-parallel", "pictures"), ("sort-last-only", "share 1")])
 def test_a_killed_rank_ends_the_run_and_is_named(config, tmp_path, topology, role):
     """Once in a while the kernel reports the other rank first, which mpiexec ended for its sake: tried again."""
     out = tmp_path / "out"
@@ -180,13 +180,11 @@ def pid_of(rank: int, out: Path) -> int:
 @pytest.mark.parametrize(
     ("sets", "expected"),
     [
-        (["pipeline.ranks=4"], "pipeline.ranks = 4: pipeline.topology = 'auto' sets them itself, expected 0"),
+        (["pipeline.ranks=4"], "pipeline.ranks = 4: pipeline.topology = 'auto' has three at most"),
         (["pipeline.topology=frame-parallel", "output.mp4=true"], "output.mp4 = true: .* no rank has all pictures"),
         (["pipeline.topology=frame-parallel", "scene.delivery=messages"], "scene.delivery = 'messages'"),
         (["pipeline.topology=sort-last-only", "scene.delivery=messages"], "scene.delivery = 'messages'"),
-        (["pipeline.topology=sort-last-only", "render.style=splats"], "render.style = 'splats': .*stored points"),
-        (["pipeline.topology=sort-last-only", "render.positions=coded"], "render.positions = 'coded'"),
-        (["pipeline.topology=sort-last-only", "sampling.pools=bytes"], "sampling.pools = 'bytes'"),
+        (["pipeline.topology=sort-last-only", "render.positions=coded"], "render.positions = 'coded': .*stored points"),
         (["pipeline.ranks=-1"], "pipeline.ranks = -1"),
     ],
 )
@@ -204,7 +202,7 @@ def test_the_plan_says_what_the_topology_does(config):
         assert compositing["left_out"] == (topology == "frame-parallel")
     assert compositing["gain"] == 3 * 163 * 91 * 8
     assert "each of 4 ranks opens the whole scene" in said["frame-parallel"]
-    assert "each of 4 ranks opens and draws about" in said["sort-last-only"]
+    assert "4 ranks, 4 cull, 4 sample, 4 render about" in said["sort-last-only"]
 
 
 # --- shares ------------------------------------------------------------------------------------------------------
