@@ -15,7 +15,7 @@ import numpy as np
 
 from ..shared.messages import RENDER_POINT, Kind, RenderPoints
 from ..shared.scene_share import SceneShare, share_borders
-from .compositing.direct import composite
+from .compositing import make_compositor
 from .job import Job
 from .pipeline import Progress
 from .record import FrameCounts, StageClock, rank_record, spread_ms
@@ -46,6 +46,8 @@ def run_sort_last(job: Job, transport: Transport, progress: Progress) -> dict[st
         StageClock(stage) for stage in ("culling", "sampling", "render", "compositing", "picture")
     ]
     counts = FrameCounts()
+    pipeline = job.config.pipeline
+    compositor = make_compositor(pipeline.compositing, transport, range(size), radix=pipeline.radix)
     octree = job.load_octree()
     culling, sampling = job.culling_node(octree), job.sampling_node(octree)
     sampling.process(job.camera(0), culling.process(job.camera(0)))  # compiles, or loads what was compiled
@@ -68,7 +70,7 @@ def run_sort_last(job: Job, transport: Transport, progress: Progress) -> dict[st
             with rendered.working():
                 drawn = render.rasterize(camera, mine)
             with met.working():
-                words = composite(frame, drawn, transport)
+                words = compositor.composite(frame, drawn)
             if words is not None:
                 with shown.working():
                     picture = render.compose(camera, words)
@@ -77,7 +79,7 @@ def run_sort_last(job: Job, transport: Transport, progress: Progress) -> dict[st
                 progress("rendering", frame + 1)
             counts.add(bits, chosen)
         rendered_s = time.perf_counter() - started
-    record = rank_record(role_of(job.config.pipeline, rank), rank) | {
+    record = rank_record(role_of(pipeline, rank), rank) | {
         "first_point": first,
         "points": stop - first,
         "stages": {clock.stage: clock.summary() for clock in clocks if clock.work_s},

@@ -129,6 +129,8 @@ class PipelineSection(Section):
     topology: Literal["auto", "single", "pipelined", "frame-parallel", "sort-last-only"] = "auto"
     ranks: Annotated[int, Field(ge=0, le=65536)] = 0
     frames_in_flight: Annotated[int, Field(ge=1, le=64)] = 4
+    compositing: Literal["auto", "direct", "direct-reduce", "binary-swap", "radix-k", "mpi-min"] = "auto"
+    radix: Annotated[int, Field(ge=2, le=1024)] = 8
     timeout_s: Positive = 300.0
 
 
