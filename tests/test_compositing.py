@@ -53,7 +53,11 @@ class World:
 
         def work(rank):
             compositor = make_compositor(policy, self.ranks[rank], ranks, **options)
-            return [compositor.composite(frame, words[ranks.index(rank)]) for frame, words in enumerate(frames)]
+            found = []
+            for frame, words in enumerate(frames):
+                whole = compositor.composite(frame, words[ranks.index(rank)])
+                found.append(None if whole is None else whole.copy())
+            return found
 
         with ThreadPoolExecutor(len(ranks)) as pool:
             root, *others = pool.map(work, ranks, timeout=3 * PATIENCE_S)

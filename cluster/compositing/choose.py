@@ -14,7 +14,7 @@ from .model import POLICIES, Rates, cheapest
 RADIX = 8
 """Of radix-k: the best or near it on most machines of Kendall et al. 2010."""
 
-RATES = Rates(latency_s=200e-6, bytes_per_s=2e9, merge_per_s=600e6, scan_per_s=800e6, message_s=30e-6)
+RATES = Rates(latency_s=150e-6, bytes_per_s=4e9, merge_per_s=900e6, scan_per_s=900e6, message_s=45e-6)
 """Between ranks of one host through ``Transport``, where nothing is measured (`splatpipe bench compositing`)."""
 
 COVERAGE = 0.25

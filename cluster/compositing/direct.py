@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..transport import Transport
-from .exchange import Held, receive_part, send_part
+from .exchange import Held, Room, receive_part, send_part
 
 
 class Direct:
@@ -15,6 +15,7 @@ class Direct:
 
     def __init__(self, transport: Transport, ranks: Sequence[int]) -> None:
         self._transport = transport
+        self._room = Room()
         self._root, self._others = ranks[0], ranks[1:]
 
     def composite(self, frame: int, words: np.ndarray) -> np.ndarray | None:
@@ -23,7 +24,7 @@ class Direct:
         if self._transport.rank != self._root:
             send_part(self._transport, self._root, frame, flat)
             return None
-        held = Held(flat)
+        held = Held(flat, self._room)
         for rank in self._others:
             held.merge(receive_part(self._transport, rank, frame, len(flat)))
         return held.words.reshape(words.shape)

@@ -21,29 +21,45 @@ class Compositor(Protocol):
         """(height, width) uint64 words of all ranks on the root, None elsewhere; ``words`` are what this rank drew.
 
         Collective over the ranks that take part, frame after frame in the same order; those other than the root go on
-        as soon as their part is done. ``words`` are not changed; with one rank they are what is returned.
+        as soon as their part is done. ``words`` are not changed. What is returned may be ``words``, or memory that the
+        next frame is made in.
         Raises MessageError for what is no framebuffer of this frame and size.
         """
         ...
 
 
-class Held:
-    """What a rank holds of a picture: words that are not to be changed until something is merged, then its own copy.
+class Room:
+    """Memory for copies of words, kept from frame to frame: the first touch of fresh pages takes longer than a copy."""
 
-    words : (n,) uint64.  is_own : they may be changed.
+    def __init__(self) -> None:
+        self._words = np.empty(0, np.uint64)
+
+    def copy_of(self, words: np.ndarray) -> np.ndarray:
+        """(n,) uint64 copy of (n,) words, until the next call."""
+        if len(self._words) < len(words):
+            self._words = np.empty(len(words), np.uint64)
+        copied = self._words[: len(words)]
+        copied[:] = words
+        return copied
+
+
+class Held:
+    """What a rank holds of a picture: words that are not to be changed until something is merged, then a copy.
+
+    words : (n,) uint64.  room : where the copy is made; None: the words may be changed.
     """
 
-    def __init__(self, words: np.ndarray, *, is_own: bool = False) -> None:
+    def __init__(self, words: np.ndarray, room: Room | None) -> None:
         self.words = words
-        self._is_own = is_own
+        self._room = room
 
     def merge(self, payload: memoryview) -> None:
         """Take the minimum with a part of as many pixels. Cost: none for an empty one."""
         if not len(payload):
             return
-        if not self._is_own:
-            self.words = self.words.copy()
-            self._is_own = True
+        if self._room is not None:
+            self.words = self._room.copy_of(self.words)
+            self._room = None
         merge_runs(payload, self.words)
 
     def narrow(self, first: int, stop: int) -> None:

@@ -20,7 +20,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from ..transport import Transport
-from .exchange import Held, receive_part, send_part
+from .exchange import Held, Room, receive_part, send_part
 
 
 def k_values(n_ranks: int, radix: int) -> tuple[int, ...]:
@@ -67,12 +67,14 @@ class Rounds:
         self._transport = transport
         self._ranks = ranks
         self._values = values
+        self._rooms = Room(), Room()  # of what is held, and of the whole picture
         self._n_met = math.prod(values)
         self._position = ranks.index(transport.rank)
 
     def composite(self, frame: int, words: np.ndarray) -> np.ndarray | None:
         """See ``Compositor``."""
-        flat, held = words.reshape(-1), Held(words.reshape(-1))
+        flat = words.reshape(-1)
+        held = Held(flat, self._rooms[0])
         self._fold(frame, held)
         if self._position < self._n_met:
             for place, group in self._groups():
@@ -115,11 +117,11 @@ class Rounds:
             return None
         if len(self._ranks) == 1:
             return flat
-        whole = flat.copy()
+        whole = self._rooms[1].copy_of(flat)
         whole[: len(held.words)] = held.words
         for position in range(1, self._n_met):
             first, stop = part_held(position, self._values, len(flat))
             if first < stop:
-                part = Held(whole[first:stop], is_own=True)
+                part = Held(whole[first:stop], None)
                 part.merge(receive_part(self._transport, self._ranks[position], frame, stop - first))
         return whole
