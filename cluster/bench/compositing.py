@@ -51,8 +51,8 @@ def bench_compositing(
     """Measure on ranks started here.
 
     ranks : numbers of ranks, each at least 2.  sizes : width and height, pixels.  coverages : shares of the pixels that
-    a rank has drawn on, above 0.  frames : timed frames of each policy.  empty : share of the ranks, the last ones, that
-    have drawn nothing; the model takes all to have drawn less.
+    a rank has drawn on, above 0.  frames : timed frames of each policy.  empty : share of the ranks, the last ones,
+    that have drawn nothing; the model takes all to have drawn less.
 
     Returns a JSON-able dict: ``rows``, one for each number of ranks, size, coverage and policy; ``rates`` of the model;
     ``extrapolated``; the machine. Raises InputError within mpiexec, DeviceError without MPI, SystemExit where a rank
@@ -211,8 +211,8 @@ def print_compositing(found: dict[str, Any], console: Any) -> None:
     console.print(
         f"assumed: links of {BLUE_GENE_P['bytes_per_s'] / 1e6:.0f} MB/s, latency {BLUE_GENE_P['latency_s'] * 1e6:g} "
         f"µs, {BLUE_GENE_P['message_s'] * 1e6:g} µs of work a message, no contention; merging and encoding as here "
-        "(its cores were slower); the paper's time is taken to be that of parts; bounds known: pixels outside those that a "
-        "rank has drawn on are not looked at"
+        "(its cores were slower); the paper's time is taken to be that of parts; bounds known: pixels outside those "
+        "that a rank has drawn on are not looked at"
     )
     machine = found["machine"]
     console.print(f"{machine['cpu']}, {machine['cores']} cores, commit {machine['commit'] or 'unknown'}")
