@@ -12,7 +12,7 @@ from .exchange import Compositor
 from .model import POLICIES, Rates, cheapest
 
 RADIX = 8
-"""Of radix-k: the best or near it on most machines of Kendall et al. 2010."""
+"""Of radix-k: few rounds, and few messages in each; which is best depends on the links (Kendall et al. 2010)."""
 
 RATES = Rates(latency_s=150e-6, bytes_per_s=4e9, merge_per_s=900e6, scan_per_s=900e6, message_s=45e-6)
 """Between ranks of one host through ``Transport``, where nothing is measured (`splatpipe bench compositing`)."""

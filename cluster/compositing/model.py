@@ -2,7 +2,7 @@
 
 A step takes a latency, then each rank that is busy in it sends, receives and merges one message after the other; the
 slowest rank counts. Ranks draw on a random share of the pixels, independently of each other: what g of them have drawn
-on is 1 − (1 − c)^g. This is the α-β-γ model of Peterka et al. 2009, section 4, with background left out.
+on is 1 − (1 − c)^g. An α-β-γ model, as is usual for collectives, with background left out.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ receives, and what it sent in earlier rounds has been taken by all ranks that ar
 rounds and frames; messages of a pair keep their order.
 
 Source: Peterka, Goodell, Ross, Shen, Thakur, "A Configurable Algorithm for Parallel Image-Compositing Applications",
-SC 2009, section 3.
+SC 2009.
 """
 
 from __future__ import annotations
