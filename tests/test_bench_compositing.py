@@ -31,7 +31,7 @@ def test_policies_take_turns_and_agree(tmp_path):
     assert done.exit_code == 0, done.output
     found = json.loads((tmp_path / "found.json").read_text())
     assert [(row["coverage"], row["policy"]) for row in found["rows"]] == [(c, p) for c in (0.2, 1) for p in POLICIES]
-    assert all(row["same_bits"] and row["ms"]["min"] > 0 for row in found["rows"])
+    assert all(row["same_bits"] and row["ms"]["min"] > 0 and row["cpu_ms"] > 0 for row in found["rows"])
     direct = found["rows"][5]
     assert direct["rank_bytes"] == HEADER.size + 16 + 8 * 64 * 48
     assert direct["rank_messages"] == 1
@@ -67,6 +67,7 @@ def test_tables_and_plot_of_what_was_found(tmp_path):
         "rank_bytes": 3e6,
         "rank_messages": 1,
         "n_drawing": 1,
+        "cpu_ms": 4.0,
     }
     model = {"ms": 1.0, "rank_bytes": 1e6, "rank_messages": 2}
     rows = [case | {"policy": p, "model": model, "auto": p == "direct", "same_bits": p != "radix-k"} for p in POLICIES]

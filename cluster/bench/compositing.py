@@ -160,7 +160,18 @@ def print_compositing(found: dict[str, Any], console: Any) -> None:
     from rich.table import Table
 
     table = Table(title=f"Compositing, {found['frames']} frames of each policy taking turns, radix {found['radix']}")
-    for name in ("ranks", "pixels", "drawn", "policy", "ms (min – p95)", "model ms", "model", "MB a rank", "messages"):
+    for name in (
+        "ranks",
+        "pixels",
+        "drawn",
+        "policy",
+        "ms (min – p95)",
+        "model ms",
+        "model",
+        "CPU ms",
+        "MB a rank",
+        "messages",
+    ):
         table.add_column(name, justify="left" if name == "policy" else "right")
     case = None
     for row in found["rows"]:
@@ -178,6 +189,7 @@ def print_compositing(found: dict[str, Any], console: Any) -> None:
             f"{ms['median']:.2f} ({ms['min']:.2f} – {ms['p95']:.2f})",
             f"{row['model']['ms']:.2f}",
             f"× {row['model']['ms'] / ms['median']:.2f}",
+            f"{row['cpu_ms']:.2f}",
             f"{sent['rank_bytes'] / 1e6:.2f}" + ("" if counted else " *"),
             f"{sent['rank_messages']:.0f}" + ("" if counted else " *"),
         )
@@ -186,8 +198,8 @@ def print_compositing(found: dict[str, Any], console: Any) -> None:
     console.print(
         f"measured here: {rates['latency_s'] * 1e6:.0f} µs until a message is taken, {rates['message_s'] * 1e6:.0f} µs "
         f"of work on it, {rates['bytes_per_s'] / 1e9:.2f} GB/s, {rates['merge_per_s'] / 1e6:.0f} M words/s merged, "
-        f"{rates['scan_per_s'] / 1e6:.0f} M pixels/s encoded, {rates['at_once']:g} ranks at once; MB and messages: the "
-        "most that a rank sends; *: by the model"
+        f"{rates['scan_per_s'] / 1e6:.0f} M pixels/s encoded, {rates['at_once']:g} ranks at once; CPU: of all ranks, "
+        "which other load changes little; MB and messages: the most that a rank sends; *: by the model"
     )
     paper = found["paper"]
     table = Table(

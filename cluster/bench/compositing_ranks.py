@@ -71,23 +71,23 @@ def _measure(
     words = drawn_words(transport.rank, width * height, mine).reshape(height, width)
     compositors = {name: make_compositor(name, transport, ranks, radix=cases["radix"]) for name in cases["policies"]}
     times: dict[str, list[float]] = {name: [] for name in compositors}
-    sent = {name: np.zeros(2) for name in compositors}
+    spent = {name: np.zeros(3) for name in compositors}
     pictures: dict[str, np.ndarray] = {}
     frame = 0
     for turn in range(_WARM_FRAMES + cases["frames"]):
         for name, compositor in compositors.items():
-            before = _sent(transport)
             started = _start_together(transport)
+            before = _spent(transport)
             whole = compositor.composite(frame, words)
             times[name].append(time.perf_counter() - started)
-            sent[name] += _sent(transport) - before
+            if turn >= _WARM_FRAMES:
+                spent[name] += _spent(transport) - before
             frame += 1
             if whole is not None and turn == 0:
                 pictures[name] = whole.copy()
     rows = []
     for name in compositors:
-        n_frames = len(times[name])
-        each = transport.join(sent[name] / n_frames).reshape(-1, 2)
+        each = transport.join(spent[name] / cases["frames"]).reshape(-1, 3)
         first = next(iter(pictures.values()), None)
         rows.append(
             {
@@ -101,6 +101,7 @@ def _measure(
                 "rank_bytes": float(each[:, 0].max()),
                 "rank_messages": float(each[:, 1].max()),
                 "all_bytes": float(each[:, 0].sum()),
+                "cpu_ms": 1e3 * float(each[:, 2].sum()),
                 "same_bits": first is None or np.array_equal(pictures[name], first),
             }
         )
@@ -115,10 +116,10 @@ def _start_together(transport: Transport) -> float:
     return start
 
 
-def _sent(transport: Transport) -> np.ndarray:
-    """Bytes and number of the framebuffers that this rank has sent."""
+def _spent(transport: Transport) -> np.ndarray:
+    """Bytes and number of the framebuffers that this rank has sent, and the CPU time it has taken, s."""
     of = transport.traffic().get(Kind.FRAMEBUFFER.name, {"bytes": 0, "count": 0})
-    return np.array([of["bytes"], of["count"]], np.float64)
+    return np.array([of["bytes"], of["count"], time.process_time()])
 
 
 def _measure_rates(transport: Transport, cases: dict[str, Any]) -> dict[str, float] | None:
