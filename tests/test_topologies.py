@@ -119,7 +119,13 @@ def test_whole_pictures_on_each_rank_are_those_of_one_rank(config, tmp_path):
 @needs_mpi
 @pytest.mark.mpi
 def test_ranks_without_a_cell_or_a_picture_have_nothing_to_do(config, scenes, tmp_path):
-    sets = [f"scene.path={scenes}/one", "output.frames=2", "render.point_size_adaptive=true", "pipeline.ranks=3"]
+    sets = [
+        f"scene.path={scenes}/one",
+        "output.frames=2",
+        "render.point_size_adaptive=true",
+        "pipeline.compositing=binary-swap",
+        "pipeline.ranks=3",
+    ]
     alone, _ = drawn(config, tmp_path / "one", *sets[:-1], "pipeline.topology=single")
     for topology in ("sort-last-only", "frame-parallel"):
         assert drawn(config, tmp_path / topology, *sets, f"pipeline.topology={topology}")[0] == alone
