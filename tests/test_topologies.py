@@ -100,6 +100,21 @@ def test_a_share_of_the_points_on_each_rank_gives_the_bits_of_one_rank(config, s
 
 @needs_mpi
 @pytest.mark.mpi
+def test_functionality_and_data_distributed_together_give_the_bits_of_one_rank(config, tmp_path):
+    """Real ranks; every topology on any number of them is in test_layout.py, as threads."""
+    alone, single = drawn(config, tmp_path / "single", "pipeline.topology=single")
+    for topology, n in (("master-slave", 4), ("hybrid", 7), ("sort-first", 4), ("sort-last", 4)):
+        together, run = drawn(config, tmp_path / topology, f"pipeline.topology={topology}", f"pipeline.ranks={n}")
+        assert together == alone, topology
+        assert (run["topology"], len(run["ranks"])) == (topology, n)
+        assert len({rank["role"] for rank in run["ranks"]}) == n
+        assert {"culling_s", "sampling_s", "render_s", "points"} <= run["per_frame"].keys()
+        if topology != "sort-first":
+            assert run["per_frame"]["points"] == single["per_frame"]["points"]
+
+
+@needs_mpi
+@pytest.mark.mpi
 def test_whole_pictures_on_each_rank_are_those_of_one_rank(config, tmp_path):
     sets = ["output.depth=true", "output.normals=true", "camera.view=stereo", "camera.stereo_base=2"]
     alone, single = drawn(config, tmp_path / "single", "pipeline.topology=single", *sets)
