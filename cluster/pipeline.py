@@ -34,7 +34,8 @@ from ..shared.messages import (
     decode_visibility,
 )
 from ..shared.scene_share import SceneShare
-from .compositing import Assembler, make_assembler
+from .compositing import make_compositor
+from .compositing.tiles import Tiles
 from .delivery import receive_scene, serve_scene
 from .job import Job, RenderStage
 from .layout import ALONE, Layout, Plan
@@ -230,13 +231,23 @@ class FrameLoop:
             job.colouring = job.colouring.with_range_of(transport.join(sample))
         if not self._renders:
             return None
-        self._assembler: Assembler | None = None
         screen = job.wall.screens[number] if job.wall and writes_screens(job, self._layout) else None
         self._waits_for_screens = self._transport if screen else None
-        if self._transport and len(self._layout.render) > 1 and not screen:
-            self._assembler = make_assembler(job.config.pipeline, self._layout, self._transport)
+        self._meet = None if screen else self._meeting()
         shown = self._shows or screen is not None
         return stack.enter_context(job.open_render(self._progress, share, shown=shown, screen=screen))
+
+    def _meeting(self) -> Callable[[int, np.ndarray], np.ndarray | None] | None:
+        """What takes a frame's number and the words of all render ranks to those of the picture, on the display rank;
+        None where one rank has it all.
+        """
+        ranks, transport, pipeline = self._layout.render, self._transport, self._job.config.pipeline
+        if transport is None or len(ranks) == 1:
+            return None
+        if self._layout.split == "tiles":
+            side_by_side = Tiles(transport, ranks)
+            return lambda frame, words: side_by_side.assemble(frame, words, self._plan.windows)
+        return make_compositor(pipeline.compositing, transport, ranks, radix=pipeline.radix).composite
 
     def _warm_up_selection(self) -> None:
         """Compile what selecting needs, or load what was compiled."""
@@ -303,10 +314,10 @@ class FrameLoop:
             of_layers = [self._take_entries(layout.lanes[0].sampling[0], len(layer.octree)) for layer in layers]
         with clock.working():
             words = render.rasterize(camera, merged_entries(camera.frame, received))
-            picture = None if self._assembler else render.compose(camera, words, of_layers)
-        if self._assembler:
+            picture = None if self._meet else render.compose(camera, words, of_layers)
+        if self._meet:
             with self._clocks["compositing"].working():
-                whole = self._assembler.assemble(camera.frame, words, self._plan.windows)
+                whole = self._meet(camera.frame, words)
             if whole is not None:
                 with self._clocks["picture"].working():
                     picture = render.compose(camera, whole, of_layers)

@@ -137,12 +137,14 @@ class SamplingPart:
         self._n_renders = len(renders)
 
     def process(self, camera: Camera, received: Sequence[VisibilityBits]) -> tuple[RenderPoints, list[RenderPoints]]:
-        """(everything chosen, by the numbers of the scene; what each render rank of the lane draws of it)."""
+        """(everything chosen of the lane's points; what each render rank of the lane draws of it)."""
         chosen = self._node.process(camera, self._merged(camera.frame, received))
         if self._windows:
             return chosen, self._node.within(camera, self._windows)
         if self._shares:
-            return chosen, [RenderPoints(camera.frame, clip_entries(chosen.entries, *of)) for of in self._shares]
+            of_shares = [RenderPoints(camera.frame, clip_entries(chosen.entries, *of)) for of in self._shares]
+            mine = np.concatenate([of.entries for of in of_shares])  # cells above a lane's own points are others'
+            return RenderPoints(camera.frame, mine), of_shares
         return chosen, [chosen] * self._n_renders
 
     def _merged(self, frame: int, received: Sequence[VisibilityBits]) -> VisibilityBits:

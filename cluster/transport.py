@@ -11,6 +11,7 @@ import json
 import math
 import time
 from collections import defaultdict, deque
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -114,6 +115,25 @@ class Transport:
         joined = np.empty(sum(counts))
         self._comm.Allgatherv(np.ascontiguousarray(values, np.float64), [joined, counts])
         return joined
+
+    def minimum_of(self, ranks: Sequence[int]) -> Callable[[np.ndarray], np.ndarray | None]:
+        """What takes (n,) uint64 of each of these ranks to their minimum on the first of them, None elsewhere.
+
+        Collective over ``ranks``, as is each call of what is returned; polite while it waits.
+        """
+        group = self._comm.Get_group()
+        chosen = group.Incl(ranks)
+        comm = self._comm.Create_group(chosen)
+        chosen.Free()
+        group.Free()
+
+        def minimum(values: np.ndarray) -> np.ndarray | None:
+            least = np.empty_like(values) if self.rank == ranks[0] else None
+            request = comm.Ireduce(np.ascontiguousarray(values), least, self._mpi.MIN, 0)
+            self._wait([request], ranks[0], "a minimum over ranks", self.timeout_s)
+            return least
+
+        return minimum
 
     def count_here(self, counted: bool) -> int:
         """How many of the ranks that share this rank's host are to be counted. Collective."""

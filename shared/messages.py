@@ -12,7 +12,7 @@ message            from → to                     payload
 ``SceneOffer``     sampling → render             ``scene.json`` and the colour mode
 ``SceneRequest``   render → sampling             array, first byte, number of bytes; nothing: no more is needed
 ``SceneBytes``     sampling → render             the bytes asked for, as they are stored
-``Framebuffer``    render → render               words of pixels, by runs (``framebuffer_runs``)
+``Framebuffer``    render → render               words of pixels, by runs (``framebuffer_runs``); none: background
 ``FilmPicture``    render → rank 0               8-bit red, green, blue of each pixel
 =================  ============================  ============================================================
 
