@@ -7,13 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers_ranks import World
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 from splatpipe.cluster.job import Job
 from splatpipe.cluster.launch import mpi_available
 from splatpipe.cluster.layout import ALONE
-from splatpipe.cluster.pipeline import run_single
+from splatpipe.cluster.pipeline import run_layout, run_single
 from splatpipe.cluster.plan.command import plan_command
 from splatpipe.cluster.sink import prepare_output
 from splatpipe.cluster.topologies import layout_of
@@ -44,7 +45,7 @@ def config(scene, tmp_path):
     path = tmp_path / "run.toml"
     path.write_text(
         f'[scene]\npath = "{scene}"\n[camera]\nwidth = 50\nheight = 31\n[output]\nframes = 3\n'
-        '[render]\npoint_size_px = 2\nrasterizer = "cpu"\n[pipeline]\ntopology = "single"\n'
+        '[render]\npoint_size_px = 2\nrasterizer = "cpu"\nthreads = 1\n[pipeline]\ntopology = "single"\n'
     )
     return path
 
@@ -59,14 +60,6 @@ def alone(config: Path, out: Path, *sets: str) -> dict[str, bytes]:
 
 def files(out: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in out.iterdir() if path.suffix in (".png", ".tiff")}
-
-
-def on_ranks(config: Path, out: Path, *sets: str) -> tuple[dict[str, bytes], dict]:
-    command = [sys.executable, "-m", "splatpipe.cluster", "run", str(config)]
-    command += [part for item in (f"output.directory={out}", *sets) for part in ("--set", item)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
-    assert done.returncode == 0, done.stderr
-    return files(out), json.loads((out / "run.json").read_text())
 
 
 def image(path: Path) -> np.ndarray:
@@ -95,6 +88,9 @@ def test_windows_of_ranks_are_the_screens_and_what_lighting_looks_at_beside_them
     assert writes_screens(job, four)
     assert not screen_windows(job, layout_of(job.config.pipeline, 3))
     assert not screen_windows(job, ALONE)
+    job.layers = [None]
+    assert not writes_screens(job, four), "layers are drawn over whole pictures"
+    assert screen_windows(job, four)
     lit = Job(load_config(config, [*TILES, "render.edl_strength=1", "render.edl_radius_px=2.5"]))
     assert screen_windows(lit, four)[3] == Window(57 - 4, 36 - 4, 107, 67)
 
@@ -133,24 +129,46 @@ def test_the_assembled_wall_has_painted_mullions_or_none(config, tmp_path):
     assert Job(load_config(config, [*wall, "wall.mullion_colour="])).picture_size == (bare.shape[1], bare.shape[0])
 
 
-@needs_mpi
-@pytest.mark.mpi
-def test_the_files_of_a_wall_are_the_same_whoever_draws_them(config, tmp_path):
-    expected = alone(config, tmp_path / "alone", *TILES, *DEEP)
-    four, run = on_ranks(config, tmp_path / "4", *TILES, *DEEP, "pipeline.topology=sort-first-only", "pipeline.ranks=4")
-    assert four == expected
-    assert "FRAMEBUFFER" not in run["messages"], "each rank writes its screen"
-    assert len(run["per_frame"]["png_s"]) == 3 * 4
-
-
-@needs_mpi
-@pytest.mark.mpi
-def test_an_assembled_wall_does_without_what_is_behind_mullions(config, tmp_path):
-    wall = ["wall.columns=2", "wall.mullion_x_px=40", "render.edl_strength=0.3", "output.depth=true"]
+@pytest.mark.parametrize("output", ["tiles", "assembled"])
+def test_the_files_of_a_wall_are_the_same_whoever_draws_them(config, tmp_path, output):
+    wall = [*TILES, *DEEP, f"wall.output={output}"]
     expected = alone(config, tmp_path / "alone", *wall)
-    two, run = on_ranks(config, tmp_path / "2", *wall, "pipeline.topology=sort-first-only", "pipeline.ranks=2")
-    assert two == expected
-    assert run["messages"]["FRAMEBUFFER"]["count"] == 3
+    assert len(expected) == 3 * 3 * (4 if output == "tiles" else 1)
+    for topology, ranks, sent in (
+        *(("sort-first-only", n, 3 * (n - 1)) for n in (1, 2, 3)),
+        ("sort-first-only", 4, 0 if output == "tiles" else 9),
+        ("sort-first", 10, 0 if output == "tiles" else 9),
+        ("hybrid", 6, 0 if output == "tiles" else 9),
+        ("sort-last-only", 4, None),
+    ):
+        sets = [f"output.directory={tmp_path / topology}{ranks}", f"pipeline.topology={topology}"]
+        sets += ["pipeline.culling_ranks=1", "pipeline.sampling_ranks=1"] if topology == "hybrid" else []
+        world = World(ranks)
+
+        def one(transport, sets=sets, ranks=ranks):
+            job = Job(load_config(config, [*wall, *sets]))
+            job.output.mkdir(exist_ok=True)
+            return run_layout(job, layout_of(job.config.pipeline, ranks), transport, lambda *_: None)
+
+        run = world.run(one)[0]
+        assert files(tmp_path / f"{topology}{ranks}") == expected, (topology, ranks)
+        assert sent is None or world.sent["FRAMEBUFFER"] == sent
+        assert len(run["per_frame"]["png_s"]) == len(expected) / 3
+
+
+@needs_mpi
+@pytest.mark.mpi
+def test_ranks_write_their_screens(config, tmp_path):
+    wall = ["wall.columns=2", "wall.mullion_x_px=9", "wall.output=tiles"]
+    command = [sys.executable, "-m", "splatpipe.cluster", "run", str(config)]
+    sets = [*wall, f"output.directory={tmp_path / 'out'}", "pipeline.topology=sort-first-only", "pipeline.ranks=2"]
+    command += [part for item in sets for part in ("--set", item)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
+    assert done.returncode == 0, done.stderr
+    assert files(tmp_path / "out") == alone(config, tmp_path / "alone", *wall)
+    run = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert run["output"][0].endswith("frame_0000_c0_r0.png … frame_0002_c1_r0.png")
+    assert (run["messages"]["FRAME_DONE"]["count"], "FRAMEBUFFER" in run["messages"]) == (3, False)
 
 
 # --- what is refused, what is said -------------------------------------------------------------------------------
