@@ -21,7 +21,7 @@ from .transport import Transport
 def frames_of(job: Job, rank: int, size: int) -> list[int]:
     """The frames, views of whole pictures, that a rank draws, ascending."""
     views = job.views.per_picture
-    return [picture * views + view for picture in range(rank, job.n_pictures, size) for view in range(views)]
+    return [picture * views + view for picture in job.pictures[rank::size] for view in range(views)]
 
 
 def run_frame_parallel(job: Job, transport: Transport, progress: Progress) -> dict[str, Any] | None:
@@ -88,7 +88,7 @@ def _merged(drawn: Drawn, told: list[dict[str, Any]], frames: list[list[int]]) -
 
     def in_order(lists: list[list[Any]]) -> list[Any]:
         found = dict(zip(drawn_in_turn, (value for values in lists for value in values), strict=True))
-        return [found[frame] for frame in range(len(found))]
+        return [found[frame] for frame in sorted(found)]
 
     clocks = [StageClock(clock.stage) for clock in drawn.clocks]
     for i, clock in enumerate(clocks):

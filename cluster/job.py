@@ -46,6 +46,7 @@ class Job:
     Frames are what the pipeline draws, views of pictures: ``n_frames`` of ``views.width`` × ``views.height`` pixels,
     ``views.per_picture`` to a picture. Sizes of points are in drawn pixels, so that they do not depend on
     ``render.supersampling`` in the picture. ``threads`` is for whoever shares the cores with other ranks to lower.
+    ``frames`` are those to draw, views of whole pictures, ascending: all, unless ``draw_only`` says otherwise.
 
     scene : the one to draw; default: that of ``scene.path``, or one without points where there are only layers.
     """
@@ -98,6 +99,7 @@ class Job:
             self.colouring = Colouring.choose(self.scene, SPLAT_COLOUR)
         self.views = camera_views(config.camera, info, self.n_pictures, render.supersampling)
         self.n_frames = self.n_pictures * self.views.per_picture
+        self.frames: Sequence[int] = range(self.n_frames)
         largest_px = render.supersampling * max(config.camera.width, config.camera.height)
         if largest_px > MAX_SIDE_PX:
             raise ConfigError(
@@ -106,6 +108,32 @@ class Job:
             )
         if config.output.mp4 and not self.background[3]:
             raise ConfigError("render.background = 'transparent', expected a colour: a film (output.mp4) has no alpha")
+        if self.film_afterwards and not config.output.png:
+            raise ConfigError("output.resume = true: a film is then made of the PNG files, expected output.png = true")
+
+    def draw_only(self, pictures: Sequence[int]) -> None:
+        """Draw these pictures, ascending, and no others."""
+        views = self.views.per_picture
+        self.frames = [picture * views + view for picture in pictures for view in range(views)]
+
+    @property
+    def pictures(self) -> list[int]:
+        """Numbers of the pictures to draw."""
+        views = self.views.per_picture
+        return [frame // views for frame in self.frames[::views]]
+
+    @property
+    def film_afterwards(self) -> bool:
+        """Whether the film is made of the pictures on disk at the end: no run that is resumed has them all in order."""
+        return self.config.output.mp4 and self.config.output.resume
+
+    @property
+    def picture_size(self) -> tuple[int, int]:
+        """Width and height of a picture as it is written, pixels."""
+        camera = self.config.camera
+        across = 2 if camera.view == "stereo" and camera.stereo_layout == "side-by-side" else 1
+        down = 2 if camera.view == "stereo" and camera.stereo_layout == "over-under" else 1
+        return across * camera.width, down * camera.height
 
     def _why_no_pools(self) -> str:
         """Why this run draws nothing from pools; empty if it may."""
@@ -251,10 +279,11 @@ class Job:
                 layers = stack.enter_context(self._open_layers())
                 layers.warm_up(self.camera(0))
             composer = sink = None
+            mp4 = output.mp4 and not self.film_afterwards
             if shown and (output.png or output.mp4 or output.depth or output.normals):
                 composer = stack.enter_context(Composer(self.picture_settings))
                 composer.warm_up([self.camera(view) for view in range(self.views.per_picture)])
-                sink = stack.enter_context(FrameSink(self.output, png=output.png, mp4=output.mp4, fps=output.fps))
+                sink = stack.enter_context(FrameSink(self.output, png=output.png, mp4=mp4, fps=output.fps))
             yield RenderStage(node, layers, composer, sink, self.views.per_picture)
 
     @contextmanager

@@ -65,7 +65,7 @@ class Drawn:
 
 def run_single(job: Job, progress: Progress) -> dict[str, Any]:
     """All three nodes in this process, frame after frame; the statistics of the run. Imports no MPI."""
-    drawn = draw_alone(job, range(job.n_frames), progress, lambda: None)
+    drawn = draw_alone(job, job.frames, progress, lambda: None)
     return drawn.record() | {"ranks": [rank_record("single", 0)], "messages": {}}
 
 
@@ -132,22 +132,22 @@ def _coordinate(job: Job, transport: Transport, progress: Progress) -> dict[str,
     progress("loading the scene", 0)
     transport.meet()
     counts = FrameCounts()
-    issued_s: list[float] = []
+    issued_s: dict[int, float] = {}
     latency_s: list[float] = []
 
     def frame_done() -> None:
         frame, _ = transport.receive_note(RENDER, Kind.FRAME_DONE)
         latency_s.append(time.perf_counter() - issued_s[frame])
-        progress("rendering", frame + 1)
+        progress("rendering", len(latency_s))
 
     started = time.perf_counter()
     loading_s = started - loading
-    for frame in range(job.n_frames):
+    for frame in job.frames:
         with clock.waiting():
-            while frame - len(latency_s) >= job.frames_in_flight or transport.has_note(RENDER, Kind.FRAME_DONE):
+            while len(issued_s) - len(latency_s) >= job.frames_in_flight or transport.has_note(RENDER, Kind.FRAME_DONE):
                 frame_done()
         camera = job.camera(frame)
-        issued_s.append(time.perf_counter())
+        issued_s[frame] = time.perf_counter()
         for rank in (SAMPLING, RENDER):
             transport.send(rank, camera)
         with clock.working():
@@ -156,7 +156,7 @@ def _coordinate(job: Job, transport: Transport, progress: Progress) -> dict[str,
         for message in (bits, *bits_of_layers):
             transport.send(SAMPLING, message)
         counts.add(bits)
-    while len(latency_s) < job.n_frames:
+    while len(latency_s) < len(issued_s):
         frame_done()
     rendered_s = time.perf_counter() - started
     of_sampling, of_render = (transport.receive_note(rank, Kind.STATISTICS)[1] for rank in (SAMPLING, RENDER))
@@ -191,7 +191,7 @@ def _sample(job: Job, transport: Transport) -> None:
     transport.meet()
     layers = [node for _, node in job.layer_nodes()]
     n_cells = [len(octree), *(len(layer.octree) for layer in job.layers)]
-    for _ in range(job.n_frames):
+    for _ in job.frames:
         with clock.waiting():
             camera = decode_camera(*transport.receive(CULLING, Kind.CAMERA, _MAX_CAMERA_BYTES))
             bits, *bits_of_layers = [
@@ -213,7 +213,7 @@ def _render(job: Job, transport: Transport) -> None:
     most_entries += [len(layer.octree) for layer in job.layers]
     with job.open_render(lambda *_: None) as render:
         transport.meet()
-        for frame in range(job.n_frames):
+        for frame in job.frames:
             with clock.waiting():
                 camera = decode_camera(*transport.receive(CULLING, Kind.CAMERA, _MAX_CAMERA_BYTES))
                 chosen, *of_layers = [

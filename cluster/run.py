@@ -24,7 +24,8 @@ from .plan.topology import Decision, decide
 from .plan.workload import Workload
 from .progress import FrameProgress
 from .record import RECORD_VERSION, machine_record
-from .sink import prepare_output
+from .resume import drawn_as, finished, prepare
+from .sink import film_of_pictures, make_output
 from .topologies import EQUAL_RANKS, FRAME_PARALLEL, check_world, ranks_to_start, role_of
 
 if TYPE_CHECKING:
@@ -45,8 +46,9 @@ def run_command(config_path: Path, overrides: list[str], json_path: Path | None)
     if wanted not in ("auto", "single") and not mpi_available():
         raise ConfigError(f"pipeline.topology = {wanted!r}: MPI is missing; install splatpipe[mpi] or choose 'single'")
     job = Job(config)  # everything that can be wrong with the input is said here, before anything starts
-    prepare_output(job.output)
-    with FrameProgress(job.n_frames) as progress:
+    if not prepare(job):
+        return _tell_finished(job, json_path)
+    with FrameProgress(len(job.frames)) as progress:
         progress.show("planning", 0)
         decision = decide(job)
         if decision.topology == "single":
@@ -111,7 +113,7 @@ def _run_rank(config_path: Path, overrides: list[str], json_path: Path | None) -
         if not (by_messages and transport.rank == RENDER):
             job = Job(config)
             if transport.rank == 0:
-                prepare_output(job.output)
+                prepare(job)
     except SplatpipeError as error:
         status, why = error.exit_status, str(error)
     statuses = transport.agree(status)
@@ -123,11 +125,13 @@ def _run_rank(config_path: Path, overrides: list[str], json_path: Path | None) -
             say_failed(f"rank {first} ({role}): {why}" if first else why, statuses[first])
         transport.meet()  # so that the line is out before a rank ends
         return max(statuses)
+    pictures = transport.join(job.pictures if job and transport.rank == 0 else []).astype(int).tolist()
     try:
         if job is None:
             job = receive_job(config, transport)
-            prepare_output(job.output)  # on a host of its own there may be no such folder yet
-        with FrameProgress(job.n_frames, on_terminal=transport.rank == 0) as progress:
+            make_output(job.output)  # on a host of its own there may be no such folder yet
+        job.draw_only(pictures)
+        with FrameProgress(len(job.frames), on_terminal=transport.rank == 0) as progress:
 
             def show(doing: str, done: int) -> None:
                 if transport.rank == 0:
@@ -198,6 +202,8 @@ def _finish(
     job: Job, decision: Decision, result: dict[str, Any], config_path: Path, json_path: Path | None
 ) -> dict[str, Any]:
     """Write ``run.json`` (last, so that a killed run leaves none); what it holds, less the per-frame lists."""
+    if job.film_afterwards:
+        film_of_pictures(job.output, job.n_pictures, job.config.output.fps)
     content = {
         "record_version": RECORD_VERSION,
         "topology": decision.topology,
@@ -208,9 +214,12 @@ def _finish(
         "scene": {"points": job.scene.info.n_points, "cells": job.scene.info.n_cells},
         "layers": [layer.told for layer in job.layers],
         "colour": job.colouring.mode,
+        "drawn_as": drawn_as(job),
         "frames": job.n_pictures,
+        "kept": job.n_pictures - len(job.pictures),
+        "drawn": len(job.pictures),
         "views_per_picture": job.views.per_picture,
-        "frames_per_s": job.n_pictures / result["rendered_s"],
+        "frames_per_s": len(job.pictures) / result["rendered_s"],
         "seconds": result["finished_s"],
         **{key: result[key] for key in result if key not in ("rendered_s", "finished_s")},
         "output": job.outputs(),
@@ -219,14 +228,24 @@ def _finish(
     }
     for path in filter(None, (job.output / "run.json", json_path)):
         write_json(path, content)
+    finished(job)
     return content
+
+
+def _tell_finished(job: Job, json_path: Path | None) -> int:
+    """Say that nothing is left to draw; the exit status."""
+    if json_path is not None:
+        write_json(json_path, json.loads((job.output / "run.json").read_text()))
+    print(f"all {job.n_pictures} frames are there; {job.output / 'run.json'} says how they were drawn")
+    return 0
 
 
 def _tell(summary: dict[str, Any]) -> None:
     console = Console(highlight=False, soft_wrap=True)
     stages = ", ".join(f"{name} {stage['work_ms']['median']:.1f} ms" for name, stage in summary["stages"].items())
+    kept = f" ({summary['kept']} of them were there)" if summary["kept"] else ""
     console.print(
-        f"{summary['frames']} frames, {summary['frames_per_s']:.1f} frames/s, {summary['topology']}, "
+        f"{summary['frames']} frames{kept}, {summary['frames_per_s']:.1f} frames/s, {summary['topology']}, "
         f"{summary['rasterizer']}; median {stages}"
     )
     if summary["layers"]:

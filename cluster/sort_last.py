@@ -58,7 +58,7 @@ def run_sort_last(job: Job, transport: Transport, progress: Progress) -> dict[st
         transport.meet()
         started = time.perf_counter()
         loading_s = started - loading
-        for frame in range(job.n_frames):
+        for done, frame in enumerate(job.frames, 1):
             camera = job.camera(frame)
             with culled.working():
                 bits = culling.process(camera)
@@ -74,7 +74,7 @@ def run_sort_last(job: Job, transport: Transport, progress: Progress) -> dict[st
                     picture = render.compose(camera, words)
                 with shown.waiting():
                     render.show(frame, picture)
-                progress("rendering", frame + 1)
+                progress("rendering", done)
             counts.add(bits, chosen)
         rendered_s = time.perf_counter() - started
     record = rank_record(role_of(job.config.pipeline, rank), rank) | {

@@ -11,6 +11,7 @@ import json
 import math
 import time
 from collections import defaultdict, deque
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -108,7 +109,7 @@ class Transport:
         self._comm.Allgather(np.array([status], np.int32), statuses)
         return statuses.tolist()
 
-    def join(self, values: np.ndarray) -> np.ndarray:
+    def join(self, values: np.ndarray | Sequence[float]) -> np.ndarray:
         """(sum of n,) float64: the (n,) values of every rank, end to end in the order of ranks. Collective."""
         counts = self.agree(len(values))
         joined = np.empty(sum(counts))

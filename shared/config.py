@@ -143,6 +143,7 @@ class OutputSection(Section):
     mp4: bool = False
     depth: bool = False
     normals: bool = False
+    resume: bool = False
 
 
 class RunConfig(Section):
