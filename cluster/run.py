@@ -57,7 +57,7 @@ def run_command(config_path: Path, overrides: list[str], json_path: Path | None)
             summary = _finish(job, decision, run_single(job, progress.show), config_path, json_path)
         else:
             ranks = ranks_to_start(config.pipeline, decision.topology)
-            status = _run_ranks(config_path, overrides, json_path, ranks, decision, progress)
+            status = _run_ranks(config_path, overrides, json_path, ranks, decision, progress, config.pipeline.timeout_s)
             if status:
                 return status  # the rank that failed has said why
             summary = json.loads((job.output / "run.json").read_text())
@@ -72,6 +72,7 @@ def _run_ranks(
     ranks: int,
     decision: Decision,
     progress: FrameProgress,
+    timeout_s: float,
 ) -> int:
     """Start the ranks and show what they report; their exit status."""
     arguments = ["run", str(config_path)]
@@ -84,6 +85,7 @@ def _run_ranks(
         ranks,
         lambda content: progress.show(content["doing"], content["done"]),
         {DECISION: decision.to_json()},
+        timeout_s=timeout_s,
     )
 
 
