@@ -22,15 +22,31 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, TextIO
 
-from ..shared.errors import DeviceError, SplatpipeError
+from ..shared.errors import DeviceError, InputError, SplatpipeError
 from .watch import MPIEXEC_ENDS_S, RANK_VARIABLES, TAG, Watch, die_with_parent, end_all
 
 RECORD = "@splatpipe "
 EXPECTED_RANKS = "SPLATPIPE_RANKS"
 _WORLD_VARIABLES = ("PMI_RANK", "PMIX_RANK", "OMPI_COMM_WORLD_RANK", "MPI_LOCALRANKID")
+_WORLD_SIZES = {
+    EXPECTED_RANKS: "mpiexec",
+    "OMPI_COMM_WORLD_SIZE": "mpiexec",
+    "PMI_SIZE": "mpiexec or srun",
+    "SLURM_STEP_NUM_TASKS": "srun",
+}
+"""Variables that say how many ranks were started, and by what; the innermost starter first."""
+_REMEDY = {
+    "": "start it with the mpiexec beside its Python, or install mpi4py for the MPI of this machine",
+    "srun": "try srun --mpi=pmix (Open MPI) or srun --mpi=pmi2 (MPICH); srun --mpi=list says what there is",
+}
 _NOISE = re.compile(
     r"^(=+|=   .*|Abort\(\d+\) on node .*|YOUR APPLICATION TERMINATED .*|This typically refers .*|"
     r"Please see the FAQ .*|)$"
+)
+
+_FRAME = "-" * 40
+_ABOUT_DEATHS = re.compile(
+    r"MPI_ABORT was invoked|noticed that process|job\s+terminated|exited with non-zero|lost commun"
 )
 
 
@@ -78,20 +94,23 @@ def launch(
     variables: Mapping[str, str] | None = None,
     module: str = "splatpipe.cluster",
     timeout_s: float = 300.0,
+    survive: bool = False,
 ) -> int:
     """Run ``python -m MODULE ARGUMENTS`` on ``ranks`` ranks; the exit status.
 
     on_record : called with each record that is not about a rank's start.
     variables : added to the environment of the ranks.
     timeout_s : how long a process of the run may be stopped before that ends it.
+    survive : where MPI can do that, the other ranks go on when one dies.
     Raises DeviceError where there is no mpiexec; SplatpipeError naming rank and cause when a rank dies without a word.
     """
     mpiexec = find_mpiexec()
     if mpiexec is None:
         raise DeviceError("mpiexec: not found beside Python or on PATH; install splatpipe[mpi] or an MPI")
+    options, survives = _options(mpiexec, survive)
     command = [
         mpiexec,
-        *_options(mpiexec),
+        *options,
         "-n",
         str(ranks),
         sys.executable,
@@ -103,7 +122,7 @@ def launch(
     environment |= {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
     tag = f"{os.getpid()}-{secrets.token_hex(8)}"
     environment[TAG] = tag
-    watch = Watch(tag, timeout_s, survives=False, say=lambda line: print(f"splatpipe: {line}", file=sys.stderr))
+    watch = Watch(tag, timeout_s, ranks if survives else 0, lambda why: print(f"splatpipe: {why}", file=sys.stderr))
     process = subprocess.Popen(
         command,
         stdin=subprocess.DEVNULL,
@@ -119,15 +138,39 @@ def launch(
         return _Relay(process, on_record, watch).run()
 
 
-def _options(mpiexec: str) -> list[str]:
+def _options(mpiexec: str, survive: bool) -> tuple[list[str], bool]:
+    """What this ``mpiexec`` needs to be told, and whether ranks will go on when one dies."""
     version = subprocess.run([mpiexec, "--version"], capture_output=True, text=True, check=False)
-    if "Open MPI" in version.stdout + version.stderr:
-        return [
-            "--oversubscribe",
-            "--bind-to",
-            "none",
-        ]  # else it refuses more ranks than cores and pins the threads
-    return []
+    if "Open MPI" not in version.stdout + version.stderr:
+        return [], False
+    options = ["--oversubscribe", "--bind-to", "none"]  # else it refuses more ranks than cores and pins the threads
+    number = re.search(r"\) (\d+)\.", version.stdout)
+    survives = survive and number is not None and int(number[1]) >= 5 and _has_ulfm(mpiexec)
+    return options + ["--with-ft", "ulfm"] * survives, survives
+
+
+def _has_ulfm(mpiexec: str) -> bool:
+    """Whether an Open MPI was built with user-level fault mitigation."""
+    info = Path(mpiexec).resolve().parent / "ompi_info"
+    info = info if info.exists() else Path(mpiexec).parent / "ompi_info"
+    try:
+        said = subprocess.run([str(info)], capture_output=True, text=True, check=False, timeout=30).stdout
+    except (OSError, subprocess.SubprocessError):
+        return False
+    return "FT MPI support: yes" in said
+
+
+def check_started(size: int, library: str) -> None:
+    """Raise InputError if the world of MPI is not what its starter says: another MPI than mpi4py's has started it."""
+    for name, starter in _WORLD_SIZES.items():
+        if not os.environ.get(name, "").isdigit():
+            continue
+        if int(os.environ[name]) != size:
+            raise InputError(
+                f"{starter}: found a world of {size} ranks, expected {os.environ[name]} ({name}): "
+                f"mpi4py's MPI ({library}) is not the one that was started; {_REMEDY.get(starter, _REMEDY[''])}"
+            )
+        return
 
 
 class _ended_with_us:
@@ -205,8 +248,21 @@ class _Relay:
 
     def _read_errors(self) -> None:
         assert self._process.stderr is not None
+        block: list[str] | None = None  # Open MPI frames what it has to say itself in dashes
         for line in self._process.stderr:
-            self._pass_on(line, sys.stderr)
+            if not line.startswith(_FRAME):
+                if block is None:
+                    self._pass_on(line, sys.stderr)
+                else:
+                    block.append(line)
+            elif block is None:
+                block = []
+            else:
+                self._tail.extend(block)
+                if not _ABOUT_DEATHS.search("".join(block)):
+                    sys.stderr.writelines(block)
+                block = None
+        self._tail.extend(block or ())
 
     def _pass_on(self, line: str, to: TextIO) -> None:
         """Print a line of a rank's, and keep one of mpiexec's."""

@@ -83,6 +83,11 @@ def finished(job: Job) -> None:
     (job.output / PARTIAL).unlink(missing_ok=True)
 
 
+def drawn_by(job: Job, pictures: list[int]) -> dict[str, int]:
+    """How many pictures were there when a run began, and how many it has drawn, for its record."""
+    return {"kept": job.n_pictures - len(pictures), "drawn": len(pictures)}
+
+
 def drawn_as(job: Job) -> dict[str, Any]:
     """Everything that the bits of a run's pictures depend on: name → value, JSON-able; long values are hashed.
 

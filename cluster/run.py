@@ -18,17 +18,18 @@ from ..shared.config import PipelineSection, RunConfig, load_config
 from ..shared.errors import ConfigError, InputError, SplatpipeError
 from ..shared.files import write_json
 from .job import Job
-from .launch import EXPECTED_RANKS, inside_mpi, launch, mpi_available, record, say_failed
+from .launch import EXPECTED_RANKS, check_started, inside_mpi, launch, mpi_available, record, say_failed
 from .plan.needs import left_out
 from .plan.topology import Decision, decide
 from .plan.workload import Workload
 from .progress import FrameProgress
 from .record import RECORD_VERSION, machine_record
-from .resume import drawn_as, finished, prepare
+from .resume import drawn_as, drawn_by, finished, prepare
 from .sink import film_of_pictures, make_output
 from .topologies import EQUAL_RANKS, FRAME_PARALLEL, check_world, ranks_to_start, role_of
 
 if TYPE_CHECKING:
+    from .survival import Survival
     from .transport import Transport
 
 DECISION = "SPLATPIPE_DECISION"
@@ -57,7 +58,7 @@ def run_command(config_path: Path, overrides: list[str], json_path: Path | None)
             summary = _finish(job, decision, run_single(job, progress.show), config_path, json_path)
         else:
             ranks = ranks_to_start(config.pipeline, decision.topology)
-            status = _run_ranks(config_path, overrides, json_path, ranks, decision, progress, config.pipeline.timeout_s)
+            status = _run_ranks(config_path, overrides, json_path, ranks, decision, progress, config.pipeline)
             if status:
                 return status  # the rank that failed has said why
             summary = json.loads((job.output / "run.json").read_text())
@@ -72,7 +73,7 @@ def _run_ranks(
     ranks: int,
     decision: Decision,
     progress: FrameProgress,
-    timeout_s: float,
+    pipeline: PipelineSection,
 ) -> int:
     """Start the ranks and show what they report; their exit status."""
     arguments = ["run", str(config_path)]
@@ -85,32 +86,43 @@ def _run_ranks(
         ranks,
         lambda content: progress.show(content["doing"], content["done"]),
         {DECISION: decision.to_json()},
-        timeout_s=timeout_s,
+        timeout_s=pipeline.timeout_s,
+        survive=pipeline.survive,
     )
 
 
 def _run_rank(config_path: Path, overrides: list[str], json_path: Path | None) -> int:
-    """Do this rank's part. What is wrong with the input is said once, by the first rank that finds something."""
-    from .pipeline import RENDER, receive_job
+    """Do this rank's part; the exit status."""
+    from .survival import Survival
     from .transport import Transport
 
     transport = Transport()
+    survival = Survival(transport)
+    try:
+        return survival.run(lambda: _attempt(config_path, overrides, json_path, transport, survival))
+    except BaseException as error:
+        _abort(transport, "starting", error)
+    return 1
+
+
+def _attempt(
+    config_path: Path, overrides: list[str], json_path: Path | None, transport: Transport, survival: Survival
+) -> int:
+    """Do this rank's part. What is wrong with the input is said once, by the first rank that finds something."""
+    from .pipeline import RENDER, receive_job
+
     config: RunConfig | None = None
     job: Job | None = None
     by_messages = False
     status, why, role = 0, "", "starting"
     try:
-        config = load_config(config_path, overrides)
+        config = survival.settled(load_config(config_path, overrides))
         role = role_of(config.pipeline, transport.rank)
         record(rank=transport.rank, role=role, pid=os.getpid())
-        expected = int(os.environ.get(EXPECTED_RANKS, 0))
-        if expected and expected != transport.size:
-            raise InputError(
-                f"mpiexec: found a world of {transport.size} ranks, expected {expected}; "
-                f"it belongs to another MPI than mpi4py's ({transport.library})"
-            )
-        transport.timeout_s = config.pipeline.timeout_s
-        check_world(config.pipeline, transport.size)
+        if not survival.lost:
+            check_started(transport.size, transport.library)
+            check_world(config.pipeline, transport.size)
+        transport.timeout_s = config.pipeline.timeout_s * (2 if transport.survives else 1)  # the launcher comes first
         by_messages = config.pipeline.topology != "single" and config.scene.delivery == "messages"
         if not (by_messages and transport.rank == RENDER):
             job = Job(config)
@@ -128,6 +140,7 @@ def _run_rank(config_path: Path, overrides: list[str], json_path: Path | None) -
         transport.meet()  # so that the line is out before a rank ends
         return max(statuses)
     pictures = transport.join(job.pictures if job and transport.rank == 0 else []).astype(int).tolist()
+    survival.pictures = pictures if survival.pictures is None else survival.pictures
     try:
         if job is None:
             job = receive_job(config, transport)
@@ -142,11 +155,14 @@ def _run_rank(config_path: Path, overrides: list[str], json_path: Path | None) -
 
             result = _run_topology(job, transport, show)
         if result is not None:
-            decision = _decided(config.pipeline, transport.size)
-            summary = _finish(job, decision, result | {"mpi": transport.library}, config_path, json_path)
+            decision = _decided(config.pipeline, transport.size, survival.lost)
+            result |= {"mpi": transport.library, "lost": survival.lost} | drawn_by(job, survival.pictures)
+            summary = _finish(job, decision, result, config_path, json_path)
             if EXPECTED_RANKS not in os.environ:
                 _tell(summary)
     except BaseException as error:
+        if transport.survives and transport.lost_a_rank(error) and not by_messages:
+            raise
         _abort(transport, role, error)
     return 0
 
@@ -177,8 +193,10 @@ def _run_topology(job: Job, transport: Transport, show: Callable[[str, int], Non
     return run_sort_last(job, transport, show)
 
 
-def _decided(pipeline: PipelineSection, ranks: int) -> Decision:
-    """What the launcher decided; where there was none, what the person who started the ranks did."""
+def _decided(pipeline: PipelineSection, ranks: int, lost: list[dict[str, Any]]) -> Decision:
+    """What the launcher decided; where there was none, what the person who started the ranks did, or a death."""
+    if lost:
+        return Decision(pipeline.topology, f"{len(lost)} of {ranks + len(lost)} ranks died: what the others can do")
     if DECISION in os.environ:
         return Decision.from_json(os.environ[DECISION])
     topology = "pipelined" if pipeline.topology == "auto" else pipeline.topology
@@ -218,8 +236,7 @@ def _finish(
         "colour": job.colouring.mode,
         "drawn_as": drawn_as(job),
         "frames": job.n_pictures,
-        "kept": job.n_pictures - len(job.pictures),
-        "drawn": len(job.pictures),
+        **drawn_by(job, job.pictures),
         "views_per_picture": job.views.per_picture,
         "frames_per_s": len(job.pictures) / result["rendered_s"],
         "seconds": result["finished_s"],
@@ -245,6 +262,9 @@ def _tell_finished(job: Job, json_path: Path | None) -> int:
 def _tell(summary: dict[str, Any]) -> None:
     console = Console(highlight=False, soft_wrap=True)
     stages = ", ".join(f"{name} {stage['work_ms']['median']:.1f} ms" for name, stage in summary["stages"].items())
+    for lost in summary.get("lost", []):
+        who = f"rank {lost['rank']} ({lost['role']}, pid {lost['pid']}, {lost['host']})"
+        console.print(f"{who} died {lost['when']}; the others drew what it had not")
     kept = f" ({summary['kept']} of them were there)" if summary["kept"] else ""
     console.print(
         f"{summary['frames']} frames{kept}, {summary['frames_per_s']:.1f} frames/s, {summary['topology']}, "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 
-from ..shared.config import PipelineSection, RunConfig
+from ..shared.config import PipelineSection, RunConfig, Topology
 from ..shared.errors import ConfigError, InputError
 
 FRAME_PARALLEL, SORT_LAST_ONLY = "frame-parallel", "sort-last-only"
@@ -54,6 +54,14 @@ def check_world(pipeline: PipelineSection, size: int) -> None:
     needed = 1 if pipeline.topology == "single" else len(PIPELINE_ROLES)
     if size < needed:
         raise InputError(f"pipeline.topology: found {size} ranks, expected {needed}: mpirun -n {needed}")
+
+
+def topology_of_survivors(config: RunConfig, size: int) -> Topology:
+    """The topology in which ``size`` ranks go on when others have died; it needs no more memory a rank than before."""
+    topology = config.pipeline.topology
+    if topology in EQUAL_RANKS or size >= len(PIPELINE_ROLES):
+        return topology
+    return "single"
 
 
 def role_of(pipeline: PipelineSection, rank: int) -> str:

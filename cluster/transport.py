@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import time
 from collections import defaultdict, deque
 from collections.abc import Sequence
@@ -20,6 +21,8 @@ from ..shared.errors import DeviceError, MessageError, SplatpipeError
 from ..shared.messages import HEADER, Kind, Message, encode, header, parse_header
 
 PIECE_BYTES = 1 << 30
+_ULFM = "OMPI_MCA_mpi_ft_enable"
+"""Set by the ``mpiexec`` of Open MPI 5 that is called with ``--with-ft ulfm``."""
 MAX_STATISTICS_BYTES = 64 << 20
 _SPINS = 50
 _SLEEP_S = (100e-6, 1e-3)
@@ -58,6 +61,47 @@ class Transport:
         self._under_way: dict[int, deque[tuple[list[Any], Any]]] = defaultdict(deque)
         self._bytes: dict[str, int] = defaultdict(int)
         self._count: dict[str, int] = defaultdict(int)
+        self._left_behind: list[Any] = []  # requests whose memory MPI may still touch
+
+    @property
+    def survives(self) -> bool:
+        """Whether ranks can go on when one has died: MPI was started with ULFM, and mpi4py knows it."""
+        return os.environ.get(_ULFM) == "1" and hasattr(self._comm, "Shrink")
+
+    def lost_a_rank(self, error: BaseException) -> bool:
+        """Whether an error says that a rank has died, or that another has noticed one, or may: of several requests
+        MPI only says that one failed.
+        """
+        mpi = self._mpi
+        classes = (mpi.ERR_PROC_FAILED, mpi.ERR_PROC_FAILED_PENDING, mpi.ERR_REVOKED, mpi.ERR_IN_STATUS)
+        return isinstance(error, mpi.Exception) and error.Get_error_class() in classes
+
+    def unanimous(self, done: bool) -> bool:
+        """Whether all ranks are done and none has died; the same answer on all. Collective, also after a death.
+
+        Who is not done makes every other rank's call fail (``lost_a_rank``), so that it comes here, too.
+        """
+        if not done and not self._comm.Is_revoked():
+            self._comm.Revoke()
+        try:
+            flag = np.array([done], np.intc)
+            self._poll([self._comm.Iagree(flag)])
+            return bool(flag[0])
+        except self._mpi.Exception:
+            return False
+
+    def go_on(self) -> list[int]:
+        """Leave out the ranks that have died; the numbers that they had. The others are numbered anew. Collective."""
+        if not self._comm.Is_revoked():
+            self._comm.Revoke()
+        shrunk = self._comm.Shrink()
+        before, after = self._comm.Get_group(), shrunk.Get_group()
+        gone = self._mpi.Group.Difference(before, after)
+        numbers = gone.Translate_ranks(range(gone.Get_size()), before)
+        self._left_behind.append((self._comm, dict(self._under_way)))
+        self._under_way.clear()
+        self._comm, self.rank, self.size = shrunk, shrunk.Get_rank(), shrunk.Get_size()
+        return list(numbers)
 
     def send(self, dest: int, message: Message) -> None:
         """Start sending a message, whose arrays must not change any more. Waits while ``depth`` are under way."""
@@ -106,14 +150,14 @@ class Transport:
     def agree(self, status: int) -> list[int]:
         """The status, or another small number, of every rank. Collective."""
         statuses = np.empty(self.size, np.int32)
-        self._comm.Allgather(np.array([status], np.int32), statuses)
+        self._poll([self._comm.Iallgather(np.array([status], np.int32), statuses)])
         return statuses.tolist()
 
     def join(self, values: np.ndarray | Sequence[float]) -> np.ndarray:
         """(sum of n,) float64: the (n,) values of every rank, end to end in the order of ranks. Collective."""
         counts = self.agree(len(values))
         joined = np.empty(sum(counts))
-        self._comm.Allgatherv(np.ascontiguousarray(values, np.float64), [joined, counts])
+        self._poll([self._comm.Iallgatherv(np.ascontiguousarray(values, np.float64), [joined, counts])])
         return joined
 
     def ranks_here(self) -> int:
@@ -141,9 +185,7 @@ class Transport:
 
     def meet(self) -> None:
         """Wait, however long it takes, until every rank is here: loading a scene has no time limit. Collective."""
-        request = self._comm.Ibarrier()
-        while not request.Test():
-            time.sleep(_SLEEP_S[1])
+        self._poll([self._comm.Ibarrier()])
 
     def finish(self) -> None:
         """Wait until everything sent has gone and every rank is here. Collective."""
@@ -181,14 +223,22 @@ class Transport:
             self._wait(queue[0][0], dest, "a message sent to it to be taken", self.timeout_s)
             queue.popleft()
 
+    def _poll(self, requests: list[Any]) -> None:
+        """Wait for a collective, however long it takes: the other ranks may be loading."""
+        self._wait(requests, -1, "", math.inf)
+
     def _wait(self, requests: list[Any], peer: int, what: str, timeout_s: float) -> None:
         testall = self._mpi.Request.Testall
-        for _ in range(_SPINS):
-            if testall(requests):
-                return
-        started = time.monotonic()
-        while not testall(requests):
-            waited_s = time.monotonic() - started
-            if waited_s > timeout_s:
-                raise SplatpipeError(f"waited {timeout_s:g} s for rank {peer}: {what}")
-            time.sleep(min(max(waited_s * _SLEEP_SHARE, _SLEEP_S[0]), _SLEEP_S[1]))
+        try:
+            for _ in range(_SPINS):
+                if testall(requests):
+                    return
+            started = time.monotonic()
+            while not testall(requests):
+                waited_s = time.monotonic() - started
+                if waited_s > timeout_s:
+                    raise SplatpipeError(f"waited {timeout_s:g} s for rank {peer}: {what}")
+                time.sleep(min(max(waited_s * _SLEEP_SHARE, _SLEEP_S[0]), _SLEEP_S[1]))
+        except BaseException:
+            self._left_behind.append(requests)
+            raise

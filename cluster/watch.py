@@ -117,12 +117,13 @@ class Watch:
     """Watches ``mpiexec`` and its ranks in a thread, and ends them when one has died, failed or fallen silent.
 
     tag : of the run, in the environment of all its processes.  timeout_s : how long a process may be stopped.
-    survives : the other ranks go on when one dies; then a stopped rank is killed, so that they notice.
+    survivable : 0, or how many ranks there are, of which the others go on when one dies once all have announced
+        themselves; then a stopped rank is killed, so that they notice.
     say : called with a line about a rank whose death is survived.
     """
 
-    def __init__(self, tag: str, timeout_s: float, survives: bool, say: Callable[[str], None]) -> None:
-        self._tag, self._timeout_s, self._survives, self._say = tag, timeout_s, survives, say
+    def __init__(self, tag: str, timeout_s: float, survivable: int, say: Callable[[str], None]) -> None:
+        self._tag, self._timeout_s, self._survivable, self._say = tag, timeout_s, survivable, say
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self._listener.bind(_address(tag))
         self._listener.listen(1024)
@@ -234,17 +235,20 @@ class Watch:
 
     def _died(self, pid: int) -> None:
         self._dead.append(pid)
-        if self._survives:
+        if self._survives(pid):
             self._say(f"{self.name(pid)} died; the others go on")
         else:
             self._deadline = min(self._deadline, time.monotonic() + MPIEXEC_ENDS_S)
+
+    def _survives(self, pid: int) -> bool:
+        return pid in self._ranks and 0 < self._survivable <= len(self._ranks)
 
     def _look(self, now: float) -> None:
         self._look_for_stopped()
         for pid, since in list(self._stopped_since.items()):
             if now - since < self._timeout_s:
                 continue
-            if self._survives and pid in self._ranks:
+            if self._survives(pid):
                 os.kill(pid, signal.SIGKILL)
             else:
                 self._end(f"{self.name(pid)} was stopped (SIGSTOP) for {self._timeout_s:g} s")

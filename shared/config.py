@@ -23,6 +23,8 @@ PositiveInt = Annotated[int, Field(ge=1)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
+Topology = Literal["auto", "single", "pipelined", "frame-parallel", "sort-last-only"]
+
 AnySection = TypeVar("AnySection", bound=Section)
 
 
@@ -126,10 +128,11 @@ class SplatSection(Section):
 class PipelineSection(Section):
     """``[pipeline]``."""
 
-    topology: Literal["auto", "single", "pipelined", "frame-parallel", "sort-last-only"] = "auto"
+    topology: Topology = "auto"
     ranks: Annotated[int, Field(ge=0, le=65536)] = 0
     frames_in_flight: Annotated[int, Field(ge=1, le=64)] = 4
     timeout_s: Positive = 300.0
+    survive: bool = True
 
 
 class OutputSection(Section):
