@@ -28,11 +28,12 @@ from .watch import MPIEXEC_ENDS_S, RANK_VARIABLES, TAG, Watch, die_with_parent, 
 RECORD = "@splatpipe "
 EXPECTED_RANKS = "SPLATPIPE_RANKS"
 _WORLD_VARIABLES = ("PMI_RANK", "PMIX_RANK", "OMPI_COMM_WORLD_RANK", "MPI_LOCALRANKID")
+_TASKS_OF_STEP = "SLURM_STEP_NUM_TASKS"
 _WORLD_SIZES = {
     EXPECTED_RANKS: "mpiexec",
     "OMPI_COMM_WORLD_SIZE": "mpiexec",
     "PMI_SIZE": "mpiexec or srun",
-    "SLURM_STEP_NUM_TASKS": "srun",
+    _TASKS_OF_STEP: "srun",
 }
 """Variables that say how many ranks were started, and by what; the innermost starter first."""
 _REMEDY = {
@@ -40,7 +41,7 @@ _REMEDY = {
     "srun": "try srun --mpi=pmix (Open MPI) or srun --mpi=pmi2 (MPICH); srun --mpi=list says what there is",
 }
 _NOISE = re.compile(
-    r"^(=+|=   .*|Abort\(\d+\) on node .*|YOUR APPLICATION TERMINATED .*|This typically refers .*|"
+    r"^(NBC_Progress: .*|=+|=   .*|Abort\(\d+\) on node .*|YOUR APPLICATION TERMINATED .*|This typically refers .*|"
     r"Please see the FAQ .*|)$"
 )
 
@@ -52,7 +53,14 @@ _ABOUT_DEATHS = re.compile(
 
 def inside_mpi() -> bool:
     """Whether this process is a rank that an ``mpiexec`` or ``srun`` has started."""
-    return any(name in os.environ for name in _WORLD_VARIABLES)
+    of_step = os.environ.get(_TASKS_OF_STEP, "1")  # without PMI srun sets nothing that MPI would know
+    return any(name in os.environ for name in _WORLD_VARIABLES) or (of_step.isdigit() and int(of_step) > 1)
+
+
+def started_rank() -> int:
+    """Number of this process among those that ``mpiexec`` or ``srun`` has started, whatever MPI makes of them."""
+    names = (name for name in (*RANK_VARIABLES, "SLURM_PROCID") if os.environ.get(name, "").isdigit())
+    return int(os.environ.get(next(names, ""), 0))
 
 
 def mpi_available() -> bool:
@@ -75,7 +83,7 @@ def record(**content: Any) -> None:
 
 def beat() -> None:
     """Tell the launcher that this rank lives."""
-    record(beat=next((int(os.environ[name]) for name in RANK_VARIABLES if name in os.environ), -1))
+    record(beat=started_rank())
 
 
 def say_failed(message: str, status: int) -> None:

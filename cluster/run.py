@@ -18,7 +18,7 @@ from ..shared.config import PipelineSection, RunConfig, load_config
 from ..shared.errors import ConfigError, InputError, SplatpipeError
 from ..shared.files import write_json
 from .job import Job
-from .launch import EXPECTED_RANKS, check_started, inside_mpi, launch, mpi_available, record, say_failed
+from .launch import EXPECTED_RANKS, check_started, inside_mpi, launch, mpi_available, record, say_failed, started_rank
 from .plan.needs import left_out
 from .plan.topology import Decision, decide
 from .plan.workload import Workload
@@ -135,7 +135,7 @@ def _attempt(
         statuses, why = [InputError.exit_status] * transport.size, "scene.delivery: not the same on every rank"
     if config is None or any(statuses):
         first = next(rank for rank in range(transport.size) if statuses[rank])
-        if transport.rank == first:
+        if transport.rank == first and (first or started_rank() == 0):  # or each of many worlds of one would say it
             say_failed(f"rank {first} ({role}): {why}" if first else why, statuses[first])
         transport.meet()  # so that the line is out before a rank ends
         return max(statuses)
