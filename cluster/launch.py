@@ -149,7 +149,7 @@ def launch(
 def _options(mpiexec: str, survive: bool) -> tuple[list[str], bool]:
     """What this ``mpiexec`` needs to be told, and whether ranks will go on when one dies."""
     version = subprocess.run([mpiexec, "--version"], capture_output=True, text=True, check=False)
-    if "Open MPI" not in version.stdout + version.stderr:
+    if not re.search(r"Open MPI|OpenRTE", version.stdout + version.stderr):  # OpenRTE: of Open MPI 4 and before
         return [], False
     options = ["--oversubscribe", "--bind-to", "none"]  # else it refuses more ranks than cores and pins the threads
     number = re.search(r"\) (\d+)\.", version.stdout)
@@ -168,6 +168,15 @@ def _has_ulfm(mpiexec: str) -> bool:
     return "FT MPI support: yes" in said
 
 
+def check_starter(library: str) -> None:
+    """Raise InputError if the ranks were started by Open MPI and ``library``, mpi4py's, is another, which cannot begin.
+
+    Other mixtures begin, as worlds of one rank each: ``check_started``.
+    """
+    if "OMPI_COMM_WORLD_SIZE" in os.environ and not library.startswith("Open MPI"):
+        raise InputError(f"mpiexec: found that of Open MPI, expected that of mpi4py's MPI ({library}); {_REMEDY['']}")
+
+
 def check_started(size: int, library: str) -> None:
     """Raise InputError if the world of MPI is not what its starter says: another MPI than mpi4py's has started it."""
     for name, starter in _WORLD_SIZES.items():
@@ -175,8 +184,8 @@ def check_started(size: int, library: str) -> None:
             continue
         if int(os.environ[name]) != size:
             raise InputError(
-                f"{starter}: found a world of {size} ranks, expected {os.environ[name]} ({name}): "
-                f"mpi4py's MPI ({library}) is not the one that was started; {_REMEDY.get(starter, _REMEDY[''])}"
+                f"{starter}: found a world of {size} ranks, expected {os.environ[name]} ({name}); "
+                f"it belongs to another MPI than mpi4py's ({library}): {_REMEDY.get(starter, _REMEDY[''])}"
             )
         return
 

@@ -96,7 +96,12 @@ def _run_rank(config_path: Path, overrides: list[str], json_path: Path | None) -
     from .survival import Survival
     from .transport import Transport
 
-    transport = Transport()
+    try:
+        transport = Transport()
+    except SplatpipeError as error:
+        if started_rank() == 0:
+            say_failed(str(error), error.exit_status)
+        return error.exit_status
     survival = Survival(transport)
     try:
         return survival.run(lambda: _attempt(config_path, overrides, json_path, transport, survival))

@@ -24,7 +24,7 @@ def check_topology(config: RunConfig) -> None:
     if config.scene.delivery == "messages":
         raise ConfigError(f"scene.delivery = 'messages': {topology}: every rank opens the scene, expected 'files'")
     if pipeline.topology == FRAME_PARALLEL:
-        if config.output.mp4:
+        if config.output.mp4 and not config.output.resume:  # then it is made of the pictures, at the end
             raise ConfigError(f"output.mp4 = true: {topology}: no rank has all pictures in order, expected false")
         return
     refused = {

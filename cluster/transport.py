@@ -11,6 +11,7 @@ import json
 import math
 import os
 import time
+import warnings
 from collections import defaultdict, deque
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -19,6 +20,7 @@ import numpy as np
 
 from ..shared.errors import DeviceError, MessageError, SplatpipeError
 from ..shared.messages import HEADER, Kind, Message, encode, header, parse_header
+from .launch import check_starter
 
 PIECE_BYTES = 1 << 30
 _ULFM = "OMPI_MCA_mpi_ft_enable"
@@ -47,14 +49,22 @@ class Transport:
 
     def __init__(self, timeout_s: float = 300.0, depth: int = 2, piece_bytes: int = PIECE_BYTES) -> None:
         try:
+            import mpi4py
+
+            mpi4py.rc.initialize = False  # an MPI that cannot start here says much and ends the process
+            mpi4py.rc.finalize = True
             from mpi4py import MPI
         except (ImportError, RuntimeError) as error:
             raise DeviceError(f"MPI: {str(error).splitlines()[0]}; install splatpipe[mpi]") from None
         self._mpi = MPI
+        self.library = MPI.Get_library_version().splitlines()[0].strip("\0 ")
+        if not MPI.Is_initialized():
+            check_starter(self.library)
+            with warnings.catch_warnings(action="ignore"):  # of another starter, which is checked once there is a world
+                MPI.Init_thread(MPI.THREAD_MULTIPLE)
         self._comm = MPI.COMM_WORLD.Dup()
         self.rank: int = self._comm.Get_rank()
         self.size: int = self._comm.Get_size()
-        self.library = MPI.Get_library_version().splitlines()[0].strip("\0 ")
         self.timeout_s = timeout_s
         self._depth = depth
         self._piece_bytes = piece_bytes
