@@ -6,7 +6,9 @@ run, job, pipeline       a run: made ready, and its frame loop on one rank or th
 topologies               which there are, how many ranks they take, what they refuse
 frame_parallel           each rank draws whole pictures
 sort_last, compositing/  each rank draws a share of the points; framebuffers meet
-transport, launch        messages between ranks; starting ranks, and who died
+transport                messages between ranks; MPI is nowhere else
+launch, watch            starting ranks; who died, stopped or fell silent
+resume, survival         going on with a run cut short, or without a rank that died
 delivery                 a scene's arrays sent to the render rank
 sink, progress, record   outputs; progress bars; what a run says about itself
 scenes                   build, synth, info, verify

@@ -128,6 +128,7 @@ def _attempt(
             check_started(transport.size, transport.library)
             check_world(config.pipeline, transport.size)
         transport.timeout_s = config.pipeline.timeout_s * (2 if transport.survives else 1)  # the launcher comes first
+        transport.patience_s = config.pipeline.loading_timeout_s
         by_messages = config.pipeline.topology != "single" and config.scene.delivery == "messages"
         if not (by_messages and transport.rank == RENDER):
             job = Job(config)
@@ -200,11 +201,11 @@ def _run_topology(job: Job, transport: Transport, show: Callable[[str, int], Non
 
 def _decided(pipeline: PipelineSection, ranks: int, lost: list[dict[str, Any]]) -> Decision:
     """What the launcher decided; where there was none, what the person who started the ranks did, or a death."""
+    topology = "pipelined" if pipeline.topology == "auto" else pipeline.topology
     if lost:
-        return Decision(pipeline.topology, f"{len(lost)} of {ranks + len(lost)} ranks died: what the others can do")
+        return Decision(topology, f"{len(lost)} of {ranks + len(lost)} ranks died: what the others can do")
     if DECISION in os.environ:
         return Decision.from_json(os.environ[DECISION])
-    topology = "pipelined" if pipeline.topology == "auto" else pipeline.topology
     return Decision(topology, f"started on {ranks} ranks by mpiexec")
 
 

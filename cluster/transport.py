@@ -8,7 +8,6 @@ ranks that work (measured: two working ranks of four on two cores lost half thei
 from __future__ import annotations
 
 import json
-import math
 import os
 import time
 import warnings
@@ -45,6 +44,7 @@ class Transport:
 
     depth : messages to one rank that may be under way before ``send`` waits (double-buffered: 2).
     timeout_s : longest wait in ``receive`` and ``send``; then SplatpipeError naming the rank waited for.
+    patience_s : longest wait for ranks that may be loading: in collectives and patient receives.
     """
 
     def __init__(self, timeout_s: float = 300.0, depth: int = 2, piece_bytes: int = PIECE_BYTES) -> None:
@@ -66,6 +66,7 @@ class Transport:
         self.rank: int = self._comm.Get_rank()
         self.size: int = self._comm.Get_size()
         self.timeout_s = timeout_s
+        self.patience_s = 3600.0
         self._depth = depth
         self._piece_bytes = piece_bytes
         self._under_way: dict[int, deque[tuple[list[Any], Any]]] = defaultdict(deque)
@@ -125,13 +126,13 @@ class Transport:
     def receive(self, source: int, expected: Kind, max_bytes: int, *, patient: bool = False) -> Received:
         """The next message of kind ``expected`` from a rank; polite while it waits.
 
-        patient : wait for it however long it takes, as for a rank that is loading a scene.
+        patient : wait for it for up to ``patience_s``, as for a rank that is loading a scene.
         Raises MessageError for a foreign header or a payload above ``max_bytes`` (nothing is allocated for it),
         SplatpipeError after ``timeout_s``.
         """
         head = bytearray(HEADER.size)
         request = self._comm.Irecv([head, self._mpi.BYTE], source, int(expected))
-        self._wait([request], source, expected.name, math.inf if patient else self.timeout_s)
+        self._wait([request], source, expected.name, self.patience_s if patient else self.timeout_s)
         kind, frame, length = parse_header(bytes(head))
         if kind is not expected:
             raise MessageError(f"from rank {source}: found {kind.name}, expected {expected.name}")
@@ -194,7 +195,7 @@ class Transport:
         return {kind: {"count": self._count[kind], "bytes": n} for kind, n in self._bytes.items()}
 
     def meet(self) -> None:
-        """Wait, however long it takes, until every rank is here: loading a scene has no time limit. Collective."""
+        """Wait until every rank is here, for up to ``patience_s``: loading a scene takes its time. Collective."""
         self._poll([self._comm.Ibarrier()])
 
     def finish(self) -> None:
@@ -234,10 +235,10 @@ class Transport:
             queue.popleft()
 
     def _poll(self, requests: list[Any]) -> None:
-        """Wait for a collective, however long it takes: the other ranks may be loading."""
-        self._wait(requests, -1, "", math.inf)
+        """Wait for a collective, for up to ``patience_s``: the other ranks may be loading."""
+        self._wait(requests, None, "all to have loaded, or finished", self.patience_s)
 
-    def _wait(self, requests: list[Any], peer: int, what: str, timeout_s: float) -> None:
+    def _wait(self, requests: list[Any], peer: int | None, what: str, timeout_s: float) -> None:
         testall = self._mpi.Request.Testall
         try:
             for _ in range(_SPINS):
@@ -247,7 +248,8 @@ class Transport:
             while not testall(requests):
                 waited_s = time.monotonic() - started
                 if waited_s > timeout_s:
-                    raise SplatpipeError(f"waited {timeout_s:g} s for rank {peer}: {what}")
+                    who = "the other ranks" if peer is None else f"rank {peer}"
+                    raise SplatpipeError(f"waited {timeout_s:g} s for {who}: {what}")
                 time.sleep(min(max(waited_s * _SLEEP_SHARE, _SLEEP_S[0]), _SLEEP_S[1]))
         except BaseException:
             self._left_behind.append(requests)

@@ -132,6 +132,7 @@ class PipelineSection(Section):
     ranks: Annotated[int, Field(ge=0, le=65536)] = 0
     frames_in_flight: Annotated[int, Field(ge=1, le=64)] = 4
     timeout_s: Positive = 300.0
+    loading_timeout_s: Positive = 3600.0
     survive: bool = True
 
 
