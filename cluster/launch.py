@@ -81,9 +81,9 @@ def record(**content: Any) -> None:
         os.write(1, f"{RECORD}{json.dumps(content)}\n".encode())  # at once, as threads send records, too
 
 
-def beat() -> None:
-    """Tell the launcher that this rank lives."""
-    record(beat=started_rank())
+def beat(lives: bool) -> None:
+    """Tell the launcher that this rank lives, or that it ends by itself."""
+    record(beat=started_rank(), lives=lives)
 
 
 def say_failed(message: str, status: int) -> None:
@@ -257,7 +257,7 @@ class _Relay:
                 )
                 self._watch.failed()
         elif "beat" in content:
-            self._watch.heard(content["beat"])
+            self._watch.heard(content["beat"], content["lives"])
         elif "pid" in content:
             self._watch.announce(content)
         else:

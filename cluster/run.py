@@ -146,7 +146,7 @@ def _attempt(
         transport.meet()  # so that the line is out before a rank ends
         return max(statuses)
     pictures = transport.join(job.pictures if job and transport.rank == 0 else []).astype(int).tolist()
-    survival.pictures = pictures if survival.pictures is None else survival.pictures
+    begun_with = survival.pictures = pictures if survival.pictures is None else survival.pictures
     try:
         if job is None:
             job = receive_job(config, transport)
@@ -162,7 +162,7 @@ def _attempt(
             result = _run_topology(job, transport, show)
         if result is not None:
             decision = _decided(config.pipeline, transport.size, survival.lost)
-            result |= {"mpi": transport.library, "lost": survival.lost} | drawn_by(job, survival.pictures)
+            result |= {"mpi": transport.library, "lost": survival.lost} | drawn_by(job, begun_with)
             summary = _finish(job, decision, result, config_path, json_path)
             if EXPECTED_RANKS not in os.environ:
                 _tell(summary)

@@ -45,10 +45,11 @@ def die_with_parent() -> None:
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
-def attach(beat: Callable[[], None]) -> None:
+def attach(beat: Callable[[bool], None]) -> None:
     """Let the launcher watch this rank until it ends; to be called first thing. Does nothing without a launcher.
 
-    beat : says that this rank lives; called every ``BEAT_S`` by a thread where the launcher is on another host.
+    beat : says that this rank lives, or that it ends by itself; where the launcher is on another host, called by a
+        thread every ``BEAT_S``.
     """
     if TAG not in os.environ:
         return
@@ -60,7 +61,10 @@ def attach(beat: Callable[[], None]) -> None:
         link.sendall(rank.encode() + b"\n")
     except OSError:
         link.close()
-        threading.Thread(target=_beat, args=(beat,), name="beat", daemon=True).start()
+        ending = threading.Event()
+        thread = threading.Thread(target=_beat, args=(beat, ending), name="beat", daemon=True)
+        thread.start()
+        atexit.register(lambda: (ending.set(), thread.join()))
         return
     threading.Thread(target=_end_with_launcher, args=(link,), name="launcher", daemon=True).start()
     atexit.register(_leave, link)
@@ -77,10 +81,11 @@ def _end_with_launcher(link: socket.socket) -> None:
     os.kill(os.getpid(), signal.SIGKILL)  # the launcher has gone, and says nothing before
 
 
-def _beat(beat: Callable[[], None]) -> None:
-    while True:
-        beat()
-        time.sleep(BEAT_S)
+def _beat(beat: Callable[[bool], None], ending: threading.Event) -> None:
+    beat(True)
+    while not ending.wait(BEAT_S):
+        beat(True)
+    beat(False)
 
 
 def _address(tag: str) -> str:
@@ -154,9 +159,12 @@ class Watch:
         """Take what a rank says of itself: rank, role, pid."""
         self._ranks[content["pid"]] = content
 
-    def heard(self, rank: int) -> None:
-        """A rank on another host lives."""
-        self._heard[rank] = time.monotonic()
+    def heard(self, rank: int, lives: bool) -> None:
+        """A rank on another host lives, or ends by itself."""
+        if lives:
+            self._heard[rank] = time.monotonic()
+        else:
+            self._heard.pop(rank, None)
 
     def failed(self) -> None:
         """A rank has failed and said why: the run must end soon."""

@@ -11,6 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
+from splatpipe.cluster import watch
 from splatpipe.cluster.launch import _options, check_started, check_starter, find_mpiexec, inside_mpi, mpi_available
 from splatpipe.cluster.topologies import topology_of_survivors
 from splatpipe.cluster.watch import processes_of
@@ -307,3 +308,37 @@ def test_software_is_no_gpu():
     assert found == sorted(set(found))
     if gl_context.is_software(renderer):
         assert 0 not in found
+
+
+# --- a launcher on another host ------------------------------------------------------------------------------------
+
+
+def test_a_rank_that_falls_silent_on_another_host_ends_the_run(monkeypatch):
+    monkeypatch.setattr(watch, "LEAST_SILENCE_S", 0.3)
+    monkeypatch.setattr(watch, "die_with_parent", lambda: None)
+    monkeypatch.setattr(watch, "BEAT_S", 0.05)
+    for silent, said in ((False, ""), (True, r"rank 3, on another host, has not been heard of for 0\.3 s")):
+        process = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(1.5)"], text=True)
+        watching = watch.Watch("of a test", 0.1, 0, print)
+        watching.start(process)
+        watching.heard(3, True)
+        if not silent:
+            watching.heard(3, False)
+        process.wait()
+        watching.finish()
+        assert re.fullmatch(said, watching.verdict), watching.verdict
+
+
+def test_a_rank_beats_where_no_launcher_is_to_be_reached_until_it_ends(monkeypatch):
+    beats, at_exit = [], []
+    monkeypatch.setenv(watch.TAG, "of no launcher here")
+    monkeypatch.setattr(watch, "die_with_parent", lambda: None)
+    monkeypatch.setattr(watch, "BEAT_S", 0.01)
+    monkeypatch.setattr(watch.atexit, "register", at_exit.append)
+    watch.attach(beats.append)
+    end = time.monotonic() + 30
+    while len(beats) < 3 and time.monotonic() < end:
+        time.sleep(0.01)
+    at_exit[0]()
+    assert beats[:3] == [True] * 3
+    assert (beats.count(False), beats[-1]) == (1, False)
