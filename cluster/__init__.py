@@ -8,7 +8,9 @@ pipeline, selection      the frame loop of a rank; its part of the octree
 compositing/             framebuffers of tiles and shares meet
 frame_parallel, film     each rank draws whole pictures; one film of them
 wall                     each rank draws and writes a screen of a display wall
-transport, launch        messages between ranks; starting ranks, and who died
+transport                messages between ranks; MPI is nowhere else
+launch, watch            starting ranks; who died, stopped or fell silent
+resume, survival         going on with a run cut short, or without a rank that died
 delivery                 a scene's arrays sent to the render rank
 sink, progress, record   outputs; progress bars; what a run says about itself
 scenes                   build, synth, info, verify

@@ -50,6 +50,9 @@ def run(
     sets: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a key: output.frames=10.")
     ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with a run that was cut short: draw only what is missing.")
+    ] = False,
     json: JsonOption = None,
 ) -> None:
     """Draw a camera path: PNG frames, a film, and run.json with where the time went.
@@ -60,7 +63,7 @@ def run(
     """
     from .run import run_command
 
-    raise typer.Exit(run_command(config, sets or [], json))
+    raise typer.Exit(run_command(config, [*(sets or []), *["output.resume=true"] * resume], json))
 
 
 @app.command()

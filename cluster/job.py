@@ -48,6 +48,7 @@ class Job:
     Frames are what the pipeline draws, views of pictures: ``n_frames`` of ``views.width`` × ``views.height`` pixels,
     ``views.per_picture`` to a picture. Sizes of points are in drawn pixels, so that they do not depend on
     ``render.supersampling`` in the picture. ``threads`` is for whoever shares the cores with other ranks to lower.
+    ``frames`` are those to draw, views of whole pictures, ascending: all, unless ``draw_only`` says otherwise.
 
     scene : the one to draw; default: that of ``scene.path``, or one without points where there are only layers.
     """
@@ -110,6 +111,24 @@ class Job:
         self.make_film: Callable[[Path, float], Film] = H264Film  # for whoever has not all pictures to replace
         if config.output.mp4 and not self.background[3]:
             raise ConfigError("render.background = 'transparent', expected a colour: a film (output.mp4) has no alpha")
+        if self.film_afterwards and not config.output.png:
+            raise ConfigError("output.resume = true: a film is then made of the PNG files, expected output.png = true")
+
+    def draw_only(self, pictures: Sequence[int]) -> None:
+        """Draw these pictures, ascending, and no others."""
+        views = self.views.per_picture
+        self.frames = [picture * views + view for picture in pictures for view in range(views)]
+
+    @property
+    def pictures(self) -> list[int]:
+        """Numbers of the pictures to draw."""
+        views = self.views.per_picture
+        return [frame // views for frame in self.frames[::views]]
+
+    @property
+    def film_afterwards(self) -> bool:
+        """Whether the film is made of the pictures on disk at the end: no run that is resumed has them all in order."""
+        return self.config.output.mp4 and self.config.output.resume
 
     def _check_sides(self) -> None:
         supersampling, sides = self.config.render.supersampling, self._panel_px
@@ -283,12 +302,13 @@ class Job:
                 layers = stack.enter_context(self._open_layers())
                 layers.warm_up(self.camera(0))
             composer = sink = None
+            mp4 = output.mp4 and not self.film_afterwards
             if shown and (output.png or output.mp4 or output.depth or output.normals):
                 settings = replace(self.picture_settings, screen=screen.window if screen else None)
                 composer = stack.enter_context(Composer(settings))
                 composer.warm_up([self.camera(view) for view in range(self.views.per_picture)])
                 sink = stack.enter_context(
-                    FrameSink(self.output, png=output.png, mp4=output.mp4, fps=output.fps, make_film=self.make_film)
+                    FrameSink(self.output, png=output.png, mp4=mp4, fps=output.fps, make_film=self.make_film)
                 )
             yield RenderStage(node, layers, composer, sink, self.views.per_picture, self._seen(screen))
 

@@ -119,7 +119,7 @@ def machine_record() -> dict[str, Any]:
         "system": f"{platform.system()} {platform.release()}",
         "python": platform.python_version(),
         "commit": _commit(),
-        "versions": {name: _version(name) for name in ("splatpipe", "numpy", "numba", "mpi4py", "moderngl")},
+        "versions": {name: package_version(name) for name in ("splatpipe", "numpy", "numba", "mpi4py", "moderngl")},
     }
 
 
@@ -143,7 +143,8 @@ def _commit() -> str | None:
         return None
 
 
-def _version(name: str) -> str | None:
+def package_version(name: str) -> str | None:
+    """Version of an installed package, None where it is not installed."""
     try:
         return version(name)
     except PackageNotFoundError:

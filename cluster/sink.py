@@ -9,7 +9,7 @@ import os
 import queue
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from concurrent.futures import Future, ThreadPoolExecutor
 from fractions import Fraction
 from pathlib import Path
@@ -18,7 +18,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from ..nodes.picture.compose import Picture
-from ..shared.errors import DeviceError
+from ..shared.errors import DeviceError, InputError
 from ..shared.files import disk_error, write_whole
 
 PNG_LEVEL = 1  # files 10 % larger than level 6 and five times as fast: the encoder must not be the slowest stage
@@ -213,24 +213,52 @@ def film_size(height: int, width: int) -> tuple[int, int]:
     return height - height % 2, width - width % 2
 
 
+def film_of_pictures(directory: Path, n_pictures: int, fps: float) -> None:
+    """Make ``film.mp4`` of the PNG files of all pictures. Raises InputError if one is unreadable or the disk full."""
+    from PIL import Image
+
+    film, whole = H264Film(directory / "film.mp4", fps), False
+    try:
+        for number in range(n_pictures):
+            with Image.open(directory / layer_name("png", number)) as image:
+                film.put(np.asarray(image.convert("RGB")))  # of 16 bits the upper 8, as in a film of a whole run
+        whole = True
+    except OSError as error:
+        raise InputError(f"{directory / layer_name('png', number)}: {error}") from None
+    finally:
+        film.close(keep=whole)
+
+
 def layer_name(layer: str, number: int, screen: str = "") -> str:
     """File name of a layer of a picture, or of what a screen of a wall shows of it."""
     prefix, suffix = LAYERS[layer]
     return f"{prefix}_{number:04d}{screen and f'_{screen}'}.{suffix}"
 
 
-def prepare_output(directory: Path) -> None:
-    """Make the output directory and take away what an earlier run left there (its pictures, film and run.json).
-
-    Raises InputError if it cannot be made or written.
-    """
+def make_output(directory: Path) -> None:
+    """Make the output directory. Raises InputError if it cannot be made or written."""
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        write_whole(directory / "run.json", lambda part: part.write_bytes(b""))  # is it writable?
-        layers = [f"{prefix}_*.{suffix}" for prefix, suffix in LAYERS.values()]
-        left = [path for pattern in [*layers, ".*.part"] for path in directory.glob(pattern)]
-        for old in [*left, directory / "film.mp4"]:
-            old.unlink(missing_ok=True)
-        (directory / "run.json").unlink()
+        probe = directory / ".writable.part"
+        probe.touch()
+        probe.unlink(missing_ok=True)  # ranks may try at the same time
+    except OSError as error:
+        raise disk_error(error, directory) from None
+
+
+def prepare_output(directory: Path, keep: Collection[str] | None = None) -> None:
+    """Make the output directory and take away what an earlier run left there (its pictures, film and records).
+
+    keep : names of pictures that stay, and with them the record of what they are (``resume``).
+    Raises InputError if it cannot be made or written.
+    """
+    make_output(directory)
+    layers = [f"{prefix}_*.{suffix}" for prefix, suffix in LAYERS.values()]
+    records = ["run.json", "run.partial.json"] if keep is None else ["run.json"]
+    try:
+        for pattern in [*records, *layers, ".*.part", "film.mp4"]:  # records before what they are about
+            for old in directory.glob(pattern):
+                if old.name not in (keep or ()):
+                    old.unlink(missing_ok=True)
     except OSError as error:
         raise disk_error(error, directory) from None

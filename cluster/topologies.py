@@ -92,3 +92,8 @@ def check_world(pipeline: PipelineSection, size: int) -> None:
 
 def _counts(pipeline: PipelineSection) -> tuple[int, int, int]:
     return pipeline.culling_ranks, pipeline.sampling_ranks, pipeline.render_ranks
+
+
+def role_of(pipeline: PipelineSection, rank: int, size: int) -> str:
+    """What a rank of ``size`` is called where it is named."""
+    return "pictures" if pipeline.topology == FRAME_PARALLEL else layout_of(pipeline, size).role_of(rank)

@@ -24,6 +24,19 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Ranks = Annotated[int, Field(ge=0, le=65536)]
 
 
+Topology = Literal[
+    "auto",
+    "single",
+    "pipelined",
+    "master-slave",
+    "hybrid",
+    "sort-first",
+    "sort-last",
+    "sort-first-only",
+    "sort-last-only",
+    "frame-parallel",
+]
+
 AnySection = TypeVar("AnySection", bound=Section)
 
 
@@ -138,18 +151,7 @@ class SplatSection(Section):
 class PipelineSection(Section):
     """``[pipeline]``."""
 
-    topology: Literal[
-        "auto",
-        "single",
-        "pipelined",
-        "master-slave",
-        "hybrid",
-        "sort-first",
-        "sort-last",
-        "sort-first-only",
-        "sort-last-only",
-        "frame-parallel",
-    ] = "auto"
+    topology: Topology = "auto"
     ranks: Ranks = 0
     culling_ranks: Ranks = 0
     sampling_ranks: Ranks = 0
@@ -159,6 +161,8 @@ class PipelineSection(Section):
     compositing: Literal["auto", "direct", "direct-reduce", "binary-swap", "radix-k", "mpi-min"] = "auto"
     radix: Annotated[int, Field(ge=2, le=1024)] = 8
     timeout_s: Positive = 300.0
+    loading_timeout_s: Positive = 3600.0
+    survive: bool = True
 
 
 class OutputSection(Section):
@@ -172,6 +176,7 @@ class OutputSection(Section):
     mp4: bool = False
     depth: bool = False
     normals: bool = False
+    resume: bool = False
 
 
 class RunConfig(Section):
