@@ -7,6 +7,7 @@ topologies               which there are, how many ranks they take, what they re
 frame_parallel           each rank draws whole pictures
 sort_last, compositing/  each rank draws a share of the points; framebuffers meet
 transport, launch        messages between ranks; starting ranks, and who died
+compression              when messages are coded: measured links, trials
 delivery                 a scene's arrays sent to the render rank
 sink, progress, record   outputs; progress bars; what a run says about itself
 scenes                   build, synth, info, verify

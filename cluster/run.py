@@ -87,6 +87,7 @@ def _run_ranks(
 
 def _run_rank(config_path: Path, overrides: list[str], json_path: Path | None) -> int:
     """Do this rank's part. What is wrong with the input is said once, by the first rank that finds something."""
+    from .compression import add_links, start_coding
     from .pipeline import RENDER, receive_job
     from .transport import Transport
 
@@ -124,6 +125,7 @@ def _run_rank(config_path: Path, overrides: list[str], json_path: Path | None) -
         transport.meet()  # so that the line is out before a rank ends
         return max(statuses)
     try:
+        transport.coding = start_coding(transport, config.pipeline)
         if job is None:
             job = receive_job(config, transport)
             prepare_output(job.output)  # on a host of its own there may be no such folder yet
@@ -134,7 +136,7 @@ def _run_rank(config_path: Path, overrides: list[str], json_path: Path | None) -
                     record(doing=doing, done=done)
                     progress.show(doing, done)
 
-            result = _run_topology(job, transport, show)
+            result = add_links(transport, _run_topology(job, transport, show))
         if result is not None:
             decision = _decided(config.pipeline, transport.size)
             summary = _finish(job, decision, result | {"mpi": transport.library}, config_path, json_path)

@@ -11,12 +11,15 @@ import json
 import math
 import time
 from collections import defaultdict, deque
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from ..shared.errors import DeviceError, MessageError, SplatpipeError
-from ..shared.messages import HEADER, Kind, Message, encode, header, parse_header
+from ..shared.messages import HEADER, Kind, Message, encode, header, is_coded, parse_header
+
+if TYPE_CHECKING:
+    from .compression import Coding
 
 PIECE_BYTES = 1 << 30
 MAX_STATISTICS_BYTES = 64 << 20
@@ -39,7 +42,10 @@ class Transport:
 
     depth : messages to one rank that may be under way before ``send`` waits (double-buffered: 2).
     timeout_s : longest wait in ``receive`` and ``send``; then SplatpipeError naming the rank waited for.
+    coding : codes what is sent (``compression``); None: nothing is. What arrives says itself whether it is coded.
     """
+
+    coding: Coding | None = None
 
     def __init__(self, timeout_s: float = 300.0, depth: int = 2, piece_bytes: int = PIECE_BYTES) -> None:
         try:
@@ -60,7 +66,10 @@ class Transport:
 
     def send(self, dest: int, message: Message) -> None:
         """Start sending a message, whose arrays must not change any more. Waits while ``depth`` are under way."""
-        self._post(dest, *encode(message))
+        head, payload = encode(message)
+        if self.coding is not None:
+            head, payload = self.coding.coded(dest, head, payload)
+        self._post(dest, head, payload)
 
     def send_note(self, dest: int, kind: Kind, frame: int, note: dict[str, Any] | None = None) -> None:
         """Start sending a small note as JSON: frame finished, statistics at the end."""
@@ -71,8 +80,8 @@ class Transport:
         """The next message of kind ``expected`` from a rank; polite while it waits.
 
         patient : wait for it however long it takes, as for a rank that is loading a scene.
-        Raises MessageError for a foreign header or a payload above ``max_bytes`` (nothing is allocated for it),
-        SplatpipeError after ``timeout_s``.
+        Raises MessageError for a foreign header, a payload above ``max_bytes`` (nothing is allocated for it) or a coded
+        one that is damaged, SplatpipeError after ``timeout_s``.
         """
         head = bytearray(HEADER.size)
         request = self._comm.Irecv([head, self._mpi.BYTE], source, int(expected))
@@ -85,6 +94,10 @@ class Transport:
         payload = np.empty(length, np.uint8)
         requests = [self._comm.Irecv([piece, self._mpi.BYTE], source, int(expected)) for piece in self._pieces(payload)]
         self._wait(requests, source, expected.name, self.timeout_s)
+        if is_coded(head):
+            from ..shared.message_codecs import unpack
+
+            payload = unpack(kind, payload.data, max_bytes)
         return Received(frame, payload.data)
 
     def receive_note(self, source: int, expected: Kind) -> tuple[int, dict[str, Any]]:
@@ -122,6 +135,14 @@ class Transport:
         here.Free()
         return n
 
+    def hosts(self) -> list[int]:
+        """Of every rank, the lowest rank on its host. Collective."""
+        here = self._comm.Split_type(self._mpi.COMM_TYPE_SHARED)
+        lowest = np.array([self.rank], np.int32)
+        here.Allreduce(self._mpi.IN_PLACE, lowest, self._mpi.MIN)
+        here.Free()
+        return self.agree(int(lowest[0]))
+
     def bounce(self, peer: int, payload: np.ndarray, *, serve: bool) -> None:
         """Send an (n,) uint8 payload to a rank and take it back, or the other way round, with MPI's own blocking calls.
 
@@ -137,6 +158,11 @@ class Transport:
     def traffic(self) -> dict[str, dict[str, int]]:
         """Messages and bytes (headers included) this rank has sent, by kind."""
         return {kind: {"count": self._count[kind], "bytes": n} for kind, n in self._bytes.items()}
+
+    def start_counting(self) -> None:
+        """Forget what ``traffic`` has counted so far."""
+        self._bytes.clear()
+        self._count.clear()
 
     def meet(self) -> None:
         """Wait, however long it takes, until every rank is here: loading a scene has no time limit. Collective."""

@@ -23,6 +23,7 @@ camera             cameras
 camera_path,       orbit, keyframes, explicit poses
 keyframes
 messages           what crosses from one rank to another
+message_codecs     the same in fewer bytes
 config             the TOML configuration of a run
 colour             attribute → colour word
 metrics            how far one picture is from another

@@ -130,6 +130,8 @@ class PipelineSection(Section):
     ranks: Annotated[int, Field(ge=0, le=65536)] = 0
     frames_in_flight: Annotated[int, Field(ge=1, le=64)] = 4
     timeout_s: Positive = 300.0
+    compression: Literal["auto", "off", "on"] = "auto"
+    link_mb_per_s: Annotated[float, Field(ge=0, le=1e9)] = 0.0
 
 
 class OutputSection(Section):

@@ -22,6 +22,7 @@ Protocol versions
     1. The first.
     2. Scenes by messages.
     3. Framebuffers.
+    4. Coded payloads (``message_codecs``).
 """
 
 from __future__ import annotations
@@ -38,8 +39,10 @@ from .errors import MessageError, StoreError
 from .scene_info import MAX_INFO_BYTES, SceneInfo, info_from_json
 
 MAGIC = b"SPLT"
-PROTOCOL_VERSION = 3
+PROTOCOL_VERSION = 4
 HEADER = struct.Struct("<4sHHQQ")
+CODED = 0x8000
+"""Bit of a header's kind that says that the payload is coded (``message_codecs``)."""
 _CAMERA = struct.Struct("<16d3d2Id")
 _SCENE_REQUEST = struct.Struct("<IIQ")
 _MAX_COLOUR_BYTES = 64
@@ -161,9 +164,14 @@ class Framebuffer:
 Message = Camera | VisibilityBits | RenderPoints | SceneOffer | SceneRequest | SceneBytes | Framebuffer
 
 
-def header(kind: Kind, frame: int, length: int) -> bytes:
+def header(kind: Kind, frame: int, length: int, *, coded: bool = False) -> bytes:
     """The 24 bytes in front of a payload."""
-    return HEADER.pack(MAGIC, PROTOCOL_VERSION, kind, frame, length)
+    return HEADER.pack(MAGIC, PROTOCOL_VERSION, kind | CODED * coded, frame, length)
+
+
+def is_coded(head: bytes | bytearray | memoryview) -> bool:
+    """Whether the payload behind a header that ``parse_header`` has taken is coded."""
+    return bool(HEADER.unpack_from(head)[2] & CODED)
 
 
 def parse_header(data: bytes | memoryview) -> tuple[Kind, int, int]:
@@ -176,7 +184,7 @@ def parse_header(data: bytes | memoryview) -> tuple[Kind, int, int]:
     if version != PROTOCOL_VERSION:
         raise MessageError(f"message header: found protocol {version}, expected {PROTOCOL_VERSION}")
     try:
-        return Kind(kind), frame, length
+        return Kind(kind & ~CODED), frame, length
     except ValueError:
         raise MessageError(f"message header: found kind {kind}, expected one of {[int(k) for k in Kind]}") from None
 

@@ -70,8 +70,8 @@ def test_render_points_survive_and_count_what_they_draw():
         (b"", "found 0 bytes, expected 24"),
         (header(Kind.CAMERA, 0, 0)[:-1], "found 23 bytes"),
         (HEADER.pack(b"NOPE", 1, 1, 0, 0), "found magic b'NOPE'"),
-        (HEADER.pack(b"SPLT", 1, 1, 0, 0), "found protocol 1, expected 3"),
-        (HEADER.pack(b"SPLT", 3, 77, 0, 0), "found kind 77"),
+        (HEADER.pack(b"SPLT", 1, 1, 0, 0), "found protocol 1, expected 4"),
+        (HEADER.pack(b"SPLT", 4, 77, 0, 0), "found kind 77"),
     ],
 )
 def test_foreign_headers_are_refused(data, said):
