@@ -1,5 +1,6 @@
 """When messages are coded, and that nobody sees it in the pictures."""
 
+import io
 import json
 import re
 import subprocess
@@ -10,9 +11,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rich.console import Console
 from splatpipe.cluster import compression
+from splatpipe.cluster.bench.messages import bench_messages, print_messages
 from splatpipe.cluster.compression import FASTEST_BYTES_PER_S, Choice, Coding, Link, Tried, pairs_that_talk
 from splatpipe.cluster.launch import find_mpiexec, mpi_available
+from splatpipe.cluster.plan.command import plan_command
 from splatpipe.shared.build import BuildSettings, build_scene
 from splatpipe.shared.message_codecs import unpack
 from splatpipe.shared.messages import (
@@ -29,6 +33,18 @@ from splatpipe.shared.synth import CityScan
 RANKS = Path(__file__).parent / "ranks"
 needs_mpi = pytest.mark.skipif(not mpi_available(), reason="mpi4py or mpiexec is missing: splatpipe[mpi]")
 GIGABIT, FAST_ETHERNET = 125e6, 12.5e6
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("compression")
+    build_scene([CityScan(n_points=20_011)], folder / "city", settings=BuildSettings(points_per_cell=300))
+    path = folder / "run.toml"
+    path.write_text(
+        '[scene]\npath = "city"\n[camera]\nwidth = 163\nheight = 91\n'
+        '[render]\npoint_size_px = 2\nrasterizer = "cpu"\n[output]\nframes = 4\n'
+    )
+    return path
 
 
 # --- the choice ------------------------------------------------------------------------------------------------------
@@ -124,6 +140,72 @@ def test_only_ranks_that_send_what_can_be_coded_are_measured():
     assert FASTEST_BYTES_PER_S > 1e9
 
 
+class SlowLink:
+    """Stands for a transport: a link that lets a burst pass and is slow from there on; its clock is simulated."""
+
+    def __init__(self, bytes_per_s: float, burst_bytes: int) -> None:
+        self.now, self._bytes_per_s, self._burst_bytes = 0.0, bytes_per_s, burst_bytes
+
+    def perf_counter(self) -> float:
+        return self.now
+
+    def send_note(self, *_) -> None: ...
+
+    receive_note = send_note
+
+    def bounce(self, _, payload: np.ndarray, *, serve: bool) -> None:
+        assert serve
+        self.now += 2 * (50e-6 + max(len(payload) - self._burst_bytes, 100) / self._bytes_per_s)
+
+
+@pytest.mark.parametrize("bytes_per_s", [1e6, 12.5e6, 125e6, 1.25e9, 10e9])
+def test_a_link_is_measured_in_fifty_milliseconds_though_bursts_pass_at_once(monkeypatch, bytes_per_s):
+    link = SlowLink(bytes_per_s, 4096)
+    monkeypatch.setattr(compression, "time", link)
+    found, latency_s = compression.measure_link(link, 1, compression.MOST_LINK_S, serve=True)  # type: ignore[arg-type]
+    assert found == pytest.approx(bytes_per_s, rel=0.35)
+    assert latency_s == pytest.approx(50e-6 + 100 / bytes_per_s)
+    assert link.now < 1.3 * compression.MOST_LINK_S
+
+
+def test_the_plan_says_what_coding_would_bring(config):
+    def part(*sets: str) -> dict:
+        plan = plan_command(config, list(sets))
+        (found,) = [part for part in plan["parts"] if part["what"] == "compression of messages"]
+        return found
+
+    assert part("pipeline.topology=single")["left_out"]
+    assert part("pipeline.topology=frame-parallel", "pipeline.ranks=4")["left_out"]
+    sort_last = ["pipeline.topology=sort-last-only", "pipeline.ranks=4"]
+    auto = part(*sort_last)
+    assert not auto["left_out"]
+    assert "auto: framebuffers, about 355,992 → " in auto["why"]
+    assert "between hosts whose link is measured below about 149 MB/s" in auto["why"]
+    slow, fast = (part(*sort_last, f"pipeline.link_mb_per_s={rate}") for rate in (1, 1000))
+    assert (slow["left_out"], fast["left_out"]) == (False, True)
+    assert slow["gain"] < 0 < fast["gain"] < auto["gain"]
+    assert "would save 185 ms at pipeline.link_mb_per_s = 1" in slow["why"]
+    assert part(*sort_last, "pipeline.compression=off")["left_out"]
+    assert "visibility bits and render-points" in part("pipeline.topology=pipelined")["why"]
+
+
+def test_the_bench_measures_every_kind_and_says_where_it_pays(config):
+    results = bench_messages([config, config.parent / "city"], ["camera.width=64"], frames=2, ranks=2, repeats=1)
+    assert [(row["scene"], row["message"]) for row in results["rows"]] == [
+        (scene, what)
+        for scene in ("run", "city")
+        for what in ("visibility", "render-points", "framebuffer", "1 of 2 shares")
+    ]
+    for row in results["rows"]:
+        assert not row["failed"]
+        assert row["coded_bytes"] < row["raw_bytes"]
+        spent_s = row["encode_s"] + row["decode_s"]
+        assert row["break_even_bytes_per_s"] == pytest.approx((row["raw_bytes"] - row["coded_bytes"]) / spent_s)
+    console = Console(width=200, record=True, file=io.StringIO())
+    print_messages(results, console)
+    assert "1 of 2 shares" in console.export_text()
+
+
 # --- on ranks --------------------------------------------------------------------------------------------------------
 
 
@@ -134,18 +216,6 @@ def test_a_link_is_measured_and_messages_cross_coded():
     done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
     said = sorted(re.findall(r"rank \d done", done.stdout))
     assert said == ["rank 0 done", "rank 1 done"], done.stdout + done.stderr
-
-
-@pytest.fixture(scope="module")
-def config(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("compression")
-    build_scene([CityScan(n_points=20_011)], folder / "city", settings=BuildSettings(points_per_cell=300))
-    path = folder / "run.toml"
-    path.write_text(
-        '[scene]\npath = "city"\n[camera]\nwidth = 163\nheight = 91\n'
-        '[render]\npoint_size_px = 2\nrasterizer = "cpu"\n[output]\nframes = 4\n'
-    )
-    return path
 
 
 def drawn(config: Path, name: str, *sets: str) -> tuple[dict[str, bytes], dict]:

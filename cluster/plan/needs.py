@@ -19,6 +19,7 @@ from .part import (
     CLASSES,
     COLOUR,
     COLOUR_MAPS,
+    COMPRESSION,
     LAYERS,
     LEVEL_OF_DETAIL,
     MPI,
@@ -42,6 +43,7 @@ def parts(job: Job, work: Workload, decision: Decision) -> list[Part]:
         _mpi(decision),
         _delivery(job, decision),
         _compositing(job, work, decision),
+        _compression(job, work, decision),
         _back_face_test(job, work),
         _level_of_detail(job, work),
         _render_point_stride(job, work),
@@ -110,6 +112,39 @@ def _compositing(job: Job, work: Workload, decision: Decision) -> Part:
     if decision.topology == FRAME_PARALLEL:
         return Part("compositing", True, "a picture is drawn by one rank", sent, "bytes/frame", "counted")
     return Part("compositing", True, "one render rank: no framebuffer is sent", sent, "bytes/frame", "counted")
+
+
+def _compression(job: Job, work: Workload, decision: Decision) -> Part:
+    """What coding takes of a frame's time, less what it saves on the links where those are configured."""
+    pipeline = job.config.pipeline
+    raw, coded, kinds = _coded_messages(job, work, decision)
+    spent_ms = 1e3 * COSTS.code_byte_s * raw
+    if decision.topology == "single" or not kinds:
+        why = "one rank: nothing is sent" if decision.topology == "single" else "no message of it has a coded form"
+        return Part(COMPRESSION, True, why, spent_ms, "ms/frame")
+    why = f"pipeline.compression is {pipeline.compression}: {kinds}, about {raw:,.0f} → {coded:,.0f} bytes a frame"
+    if pipeline.link_mb_per_s:
+        saved_ms = 1e-3 * (raw - coded) / pipeline.link_mb_per_s
+        why += f", would save {saved_ms:.3g} ms at pipeline.link_mb_per_s = {pipeline.link_mb_per_s:g}"
+        off = pipeline.compression == "off" or (pipeline.compression == "auto" and saved_ms <= spent_ms)
+        return Part(COMPRESSION, off, why, spent_ms - saved_ms, "ms/frame")
+    if pipeline.compression == "auto":
+        even = 1e-3 * (raw - coded) / spent_ms
+        why += f"; coded between hosts whose link is measured below about {even:,.0f} MB/s"
+    return Part(COMPRESSION, pipeline.compression == "off", why, spent_ms, "ms/frame")
+
+
+def _coded_messages(job: Job, work: Workload, decision: Decision) -> tuple[float, float, str]:
+    """Bytes of a frame's messages that have a coded form, at most; those coded, about; which they are."""
+    if decision.topology == SORT_LAST_ONLY:
+        others = ranks_to_start(job.config.pipeline, decision.topology) - 1
+        raw = float(others * work.pixels * FRAMEBUFFER_EMPTY.nbytes)
+        return raw, raw * COSTS.coded_framebuffer, "framebuffers" if others else ""
+    if decision.topology == FRAME_PARALLEL:
+        return 0.0, 0.0, ""
+    raw = work.cells / 8 + RENDER_POINT.itemsize * work.entries
+    coded = COSTS.coded_bits * work.cells / 8 + COSTS.coded_entry_bytes * work.entries
+    return raw, coded, "visibility bits and render-points"
 
 
 def _back_face_test(job: Job, work: Workload) -> Part:
