@@ -283,7 +283,8 @@ def _measure(
 def measure_link(transport: Transport, peer: int, budget_s: float, *, serve: bool) -> tuple[float, float]:
     """(bytes a second, seconds of latency) of the link to a rank that calls this, too, one of them with ``serve``.
 
-    One growing payload there and back, as large as the budget allows: a shaped link lets a burst pass at full speed.
+    One growing payload there and back, as large as the budget allows; a shaped link lets a burst pass at full speed, so
+    the two largest tell what it does beyond.
     Both ranks return the same figures.
     """
     transport.send_note(peer, Kind.STATISTICS, 0)  # both are here: until then they wait politely
@@ -302,10 +303,12 @@ def measure_link(transport: Transport, peer: int, budget_s: float, *, serve: boo
             control = np.array(sizes, np.int64).view(np.uint8)
             transport.bounce(peer, control, serve=serve)
             sizes = [n for n in control.view(np.int64).tolist() if 0 < n <= _MOST_BYTES]
-    largest = samples[-1][0]
-    latency_s = min(seconds for n, seconds in samples if n == 1)
-    one_way_s = median(seconds for n, seconds in samples if n == largest)
-    told = np.array([largest / max(one_way_s - latency_s, 1e-9), latency_s])
+    seconds = {n: median(t for size, t in samples if size == n) for n in sorted({n for n, _ in samples})}
+    (*_, (before, before_s), (largest, largest_s)) = seconds.items()
+    latency_s = min(t for n, t in samples if n == 1)
+    whole = largest / max(largest_s - latency_s, 1e-9)
+    beyond_burst = (largest - before) / max(largest_s - before_s, 1e-9)
+    told = np.array([min(whole, beyond_burst), latency_s])
     control = told.view(np.uint8)
     transport.bounce(peer, control, serve=serve)
     bytes_per_s, latency_s = control.view(np.float64).tolist()
@@ -319,7 +322,7 @@ def _next_size(samples: list[tuple[int, float]], left_s: float) -> int:
         done = [seconds for n, seconds in samples if n == n_bytes]
         return n_bytes if len(done) < _FEW and 2 * sum(done) < min(_FEW_S, left_s) else 0
     fits = int(n_bytes * left_s / (2 * one_way_s))
-    return min(8 * n_bytes, fits, _MOST_BYTES) if fits > 1.5 * n_bytes else 0
+    return min(4 * n_bytes, fits, _MOST_BYTES) if fits > 1.5 * n_bytes else 0
 
 
 def _warm_up() -> None:
