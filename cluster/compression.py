@@ -30,11 +30,12 @@ from .transport import Transport
 FASTEST_BYTES_PER_S = 2e9
 """Nothing pays on a faster link: break-even was below 0.9 GB/s for every message of ``splatpipe bench messages``."""
 MOST_LINK_S = 50e-3
-"""Longest that measuring a link takes, and the longest of all links of a rank in units of 20."""
+"""Longest that measuring a link takes; all links of a rank together at most 20 times as long."""
 _TRIALS = 3
 _AGAIN = 64
 _SETTINGS = ("off", "auto", "on")
 _FIRST_BYTES, _MOST_BYTES = 1 << 14, 1 << 22
+_MOST_BURST = 4  # by so much a burst may mislead; a lower figure is a hiccup in one sample
 _FEW_S, _FEW = 5e-3, 5  # a fast link is bounced over again, so often and no longer
 
 
@@ -203,7 +204,7 @@ class Coding:
 
 def pairs_that_talk(topology: str, size: int) -> list[tuple[int, int]]:
     """Pairs of ranks, the lower first, between which messages cross that can be coded."""
-    if topology == "pipelined":
+    if topology in ("auto", "pipelined"):
         return [(rank, rank + 1) for rank in range(len(PIPELINE_ROLES) - 1)]
     if topology == SORT_LAST_ONLY:
         return [(0, rank) for rank in range(1, size)]
@@ -215,7 +216,7 @@ def start_coding(
 ) -> Coding | None:
     """What ``transport.coding`` is to be; None where nothing is coded. Collective.
 
-    pairs : of ranks that will talk, the same on every rank; None: as the topology says.
+    pairs : of ranks that will talk, the same in the same order on every rank; None: as the topology says.
     Where ranks do not agree on the setting, the most careful holds.
     Cost: for ``auto`` at most ``MOST_LINK_S`` a link, and a second for all of a rank; once kernels that may be needed.
     """
@@ -308,7 +309,7 @@ def measure_link(transport: Transport, peer: int, budget_s: float, *, serve: boo
     latency_s = min(t for n, t in samples if n == 1)
     whole = largest / max(largest_s - latency_s, 1e-9)
     beyond_burst = (largest - before) / max(largest_s - before_s, 1e-9)
-    told = np.array([min(whole, beyond_burst), latency_s])
+    told = np.array([max(min(whole, beyond_burst), whole / _MOST_BURST), latency_s])
     control = told.view(np.uint8)
     transport.bounce(peer, control, serve=serve)
     bytes_per_s, latency_s = control.view(np.float64).tolist()

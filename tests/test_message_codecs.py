@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from splatpipe.shared import message_codecs
+from splatpipe.shared.codecs.varints import write_varints
 from splatpipe.shared.errors import MessageError
 from splatpipe.shared.framebuffer_runs import encode_runs, most_bytes
 from splatpipe.shared.message_codecs import CODED_KINDS, form_of, has_zstd, pack, unpack
@@ -55,6 +57,10 @@ def sample(kind: Kind, seed: int) -> np.ndarray:
             return encode_runs(picture(rng, 500))
 
 
+def varints(*numbers: int) -> bytes:
+    return write_varints(np.array(numbers)).tobytes()
+
+
 # --- round trips -----------------------------------------------------------------------------------------------------
 
 
@@ -93,6 +99,38 @@ def test_any_words_survive(words, times):
 @given(st.sampled_from(list(Kind)), st.binary(max_size=200))
 def test_any_payload_survives_or_is_sent_as_it_is(kind, payload):
     again(kind, np.frombuffer(payload, np.uint8), zstd=has_zstd())
+
+
+# --- the kernels beside NumPy ----------------------------------------------------------------------------------------
+
+
+@settings(max_examples=100, derandomize=True, deadline=None)
+@given(st.lists(st.tuples(st.booleans(), st.integers(1, 300)), min_size=2, max_size=20))
+def test_runs_of_bits_are_those_that_numpy_finds(runs):
+    bits = np.packbits(np.array([bit for bit, n in runs for _ in range(n)], bool), bitorder="little")
+    flat = np.unpackbits(bits, bitorder="little")
+    edges = np.flatnonzero(np.diff(flat, prepend=1 - flat[0], append=1 - flat[-1]))
+    expected = b"R" + bytes(flat[:1]) + varints(len(bits), *np.diff(edges))
+    coded = pack(Kind.VISIBILITY, bits.data)
+    assert coded is None or coded.tobytes() == expected
+    assert unpack(Kind.VISIBILITY, expected, len(bits)).tobytes() == bits.tobytes()
+
+
+@settings(max_examples=100, derandomize=True, deadline=None)
+@given(st.lists(word, min_size=1, max_size=40))
+def test_planes_are_the_differences_that_numpy_finds(words):
+    words = np.array(words, np.uint64)
+    depth = np.diff((words >> np.uint64(32)).astype(np.uint32), prepend=np.uint32(0))
+    depth = depth << 1 ^ (depth.view(np.int32) >> 31).view(np.uint32)
+    red, green, blue, last = (words.astype("<u8").view(np.uint8).reshape(-1, 8)[:, i] for i in range(4))
+    colour = [np.diff(column, prepend=np.uint8(0)) for column in (green, red - green, blue - green, last)]
+    expected = np.concatenate([depth.astype("<u4").view(np.uint8).reshape(-1, 4).T.ravel(), *colour])
+    planes = np.empty(8 * len(words), np.uint8)
+    message_codecs._write_planes(words, planes)
+    assert np.array_equal(planes, expected)
+    again = np.empty_like(words)
+    message_codecs._read_planes(expected, again)
+    assert np.array_equal(again, words)
 
 
 # --- sizes -----------------------------------------------------------------------------------------------------------
@@ -175,12 +213,6 @@ def test_damaged_payloads_are_refused_or_give_one_of_its_size(kind, zstd):
             except MessageError:
                 refused += 1
     assert refused > 5000
-
-
-def varints(*numbers: int) -> bytes:
-    from splatpipe.shared.codecs.varints import write_varints
-
-    return write_varints(np.array(numbers)).tobytes()
 
 
 def framed(data: bytes, **how) -> bytes:
