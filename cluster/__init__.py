@@ -9,6 +9,7 @@ compositing/             framebuffers of tiles and shares meet
 frame_parallel, film     each rank draws whole pictures; one film of them
 wall                     each rank draws and writes a screen of a display wall
 transport                messages between ranks; MPI is nowhere else
+compression              when messages are coded: measured links, trials
 launch, watch            starting ranks; who died, stopped or fell silent
 resume, survival         going on with a run cut short, or without a rank that died
 delivery                 a scene's arrays sent to the render rank

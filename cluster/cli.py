@@ -531,6 +531,29 @@ def bench_compositing(
     raise typer.Exit(int(not all(row["same_bits"] for row in found["rows"])))
 
 
+@bench_app.command("messages")
+def bench_messages(
+    inputs: Annotated[list[Path], typer.Argument(help="Configurations of runs, or scenes.")],
+    sets: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a key.")] = None,
+    frames: Annotated[int, typer.Option(help="Frames of each, spread over the camera path.", min=1)] = 5,
+    ranks: Annotated[int, typer.Option(help="Framebuffers also of one of so many shares.", min=1)] = 4,
+    repeats: Annotated[int, typer.Option(help="Times that each is measured.", min=1)] = 5,
+    json: JsonOption = None,
+) -> None:
+    """Coded messages: bytes, encode, decode, and the bandwidth below which coding pays.
+
+    Exit status 1 if what is decoded is not what was coded.
+
+    Example: `splatpipe bench messages configs/demo.toml survey.scene --json messages.json`
+    """
+    from .bench.messages import bench_messages as measure
+    from .bench.messages import print_messages
+
+    results = measure(inputs, sets or [], frames=frames, ranks=ranks, repeats=repeats)
+    _report(results, print_messages, json)
+    raise typer.Exit(int(any(row["failed"] for row in results["rows"])))
+
+
 @bench_app.command("lod")
 def bench_lod(
     points: Annotated[int, typer.Option(help="Number of points of each scene.", min=1000)] = 100_000_000,

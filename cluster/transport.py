@@ -13,13 +13,16 @@ import time
 import warnings
 from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from ..shared.errors import DeviceError, MessageError, SplatpipeError
-from ..shared.messages import HEADER, Kind, Message, encode, header, parse_header
+from ..shared.messages import HEADER, Kind, Message, encode, header, is_coded, parse_header
 from .launch import check_starter
+
+if TYPE_CHECKING:
+    from .compression import Coding
 
 PIECE_BYTES = 1 << 30
 _ULFM = "OMPI_MCA_mpi_ft_enable"
@@ -45,7 +48,10 @@ class Transport:
     depth : messages to one rank that may be under way before ``send`` waits (double-buffered: 2).
     timeout_s : longest wait in ``receive`` and ``send``; then SplatpipeError naming the rank waited for.
     patience_s : longest wait for ranks that may be loading: in collectives and patient receives.
+    coding : codes what is sent (``compression``); None: nothing is. What arrives says itself whether it is coded.
     """
+
+    coding: Coding | None = None
 
     def __init__(self, timeout_s: float = 300.0, depth: int = 2, piece_bytes: int = PIECE_BYTES) -> None:
         try:
@@ -116,7 +122,10 @@ class Transport:
 
     def send(self, dest: int, message: Message) -> None:
         """Start sending a message, whose arrays must not change any more. Waits while ``depth`` are under way."""
-        self._post(dest, *encode(message))
+        head, payload = encode(message)
+        if self.coding is not None:
+            head, payload = self.coding.coded(dest, head, payload)
+        self._post(dest, head, payload)
 
     def send_note(self, dest: int, kind: Kind, frame: int, note: dict[str, Any] | None = None) -> None:
         """Start sending a small note as JSON: frame finished, statistics at the end."""
@@ -127,8 +136,8 @@ class Transport:
         """The next message of kind ``expected`` from a rank; polite while it waits.
 
         patient : wait for it for up to ``patience_s``, as for a rank that is loading a scene.
-        Raises MessageError for a foreign header or a payload above ``max_bytes`` (nothing is allocated for it),
-        SplatpipeError after ``timeout_s``.
+        Raises MessageError for a foreign header, a payload above ``max_bytes`` (nothing is allocated for it) or a coded
+        one that is damaged, SplatpipeError after ``timeout_s``.
         """
         head = bytearray(HEADER.size)
         request = self._comm.Irecv([head, self._mpi.BYTE], source, int(expected))
@@ -141,6 +150,10 @@ class Transport:
         payload = np.empty(length, np.uint8)
         requests = [self._comm.Irecv([piece, self._mpi.BYTE], source, int(expected)) for piece in self._pieces(payload)]
         self._wait(requests, source, expected.name, self.timeout_s)
+        if is_coded(head):
+            from ..shared.message_codecs import unpack
+
+            payload = unpack(kind, payload.data, max_bytes)
         return Received(frame, payload.data)
 
     def receive_note(self, source: int, expected: Kind) -> tuple[int, dict[str, Any]]:
@@ -197,6 +210,14 @@ class Transport:
         here.Free()
         return n
 
+    def hosts(self) -> list[int]:
+        """Of every rank, the lowest rank on its host. Collective."""
+        here = self._comm.Split_type(self._mpi.COMM_TYPE_SHARED)
+        lowest = np.array([self.rank], np.int32)
+        here.Allreduce(self._mpi.IN_PLACE, lowest, self._mpi.MIN)
+        here.Free()
+        return self.agree(int(lowest[0]))
+
     def bounce(self, peer: int, payload: np.ndarray, *, serve: bool) -> None:
         """Send an (n,) uint8 payload to a rank and take it back, or the other way round, with MPI's own blocking calls.
 
@@ -212,6 +233,11 @@ class Transport:
     def traffic(self) -> dict[str, dict[str, int]]:
         """Messages and bytes (headers included) this rank has sent, by kind."""
         return {kind: {"count": self._count[kind], "bytes": n} for kind, n in self._bytes.items()}
+
+    def start_counting(self) -> None:
+        """Forget what ``traffic`` has counted so far."""
+        self._bytes.clear()
+        self._count.clear()
 
     def meet(self) -> None:
         """Wait until every rank is here, for up to ``patience_s``: loading a scene takes its time. Collective."""
