@@ -50,6 +50,9 @@ def run(
     sets: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a key: output.frames=10.")
     ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with a run that was cut short: draw only what is missing.")
+    ] = False,
     json: JsonOption = None,
 ) -> None:
     """Draw a camera path: PNG frames, a film, and run.json with where the time went.
@@ -60,7 +63,7 @@ def run(
     """
     from .run import run_command
 
-    raise typer.Exit(run_command(config, sets or [], json))
+    raise typer.Exit(run_command(config, [*(sets or []), *["output.resume=true"] * resume], json))
 
 
 @app.command()
@@ -533,6 +536,58 @@ def bench_balance(
         workdir=workdir,
     )
     _report(results, print_balance, json)
+
+
+@bench_app.command("compositing")
+def bench_compositing(
+    ranks: Annotated[str, typer.Option(metavar="N,N,…", help="Numbers of ranks, each at least 2.")] = "2,4",
+    sizes: Annotated[str, typer.Option(metavar="WIDTHxHEIGHT,…", help="Pictures, pixels.")] = "1280x720",
+    coverages: Annotated[str, typer.Option(metavar="%,%,…", help="Pixels that a rank has drawn on.")] = "10,50",
+    policies: Annotated[str, typer.Option(metavar="NAME,…", help="Of pipeline.compositing; all of them.")] = "",
+    empty: Annotated[float, typer.Option(help="Ranks that have drawn nothing, %.", min=0, max=99)] = 0,
+    radix: Annotated[int, typer.Option(help="Of radix-k.", min=2, max=1024)] = 8,
+    frames: Annotated[int, typer.Option(help="Timed frames of each policy.", min=1)] = 15,
+    plot: Annotated[Path | None, typer.Option(help="PNG file: measured and model, and the model by ranks.")] = None,
+    json: JsonOption = None,
+) -> None:
+    """Policies of sort-last compositing on ranks started here, beside the model and radix-k's published figure.
+
+    Exit status 1 if one policy's picture has other bits than another's.
+
+    Example: `splatpipe bench compositing --ranks 2,3,4 --sizes 1280x720,1920x1080 --json compositing.json`
+    """
+    from .bench.compositing import bench_compositing as measure
+    from .bench.compositing import parse_cases, plot_compositing, print_compositing
+
+    cases = parse_cases(ranks, sizes, parse_numbers(coverages, "--coverages"), policies)
+    found = measure(**cases, radix=radix, frames=frames, empty=empty / 100)
+    if plot is not None:
+        plot_compositing(found, plot)
+    _report(found, print_compositing, json)
+    raise typer.Exit(int(not all(row["same_bits"] for row in found["rows"])))
+
+
+@bench_app.command("messages")
+def bench_messages(
+    inputs: Annotated[list[Path], typer.Argument(help="Configurations of runs, or scenes.")],
+    sets: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a key.")] = None,
+    frames: Annotated[int, typer.Option(help="Frames of each, spread over the camera path.", min=1)] = 5,
+    ranks: Annotated[int, typer.Option(help="Framebuffers also of one of so many shares.", min=1)] = 4,
+    repeats: Annotated[int, typer.Option(help="Times that each is measured.", min=1)] = 5,
+    json: JsonOption = None,
+) -> None:
+    """Coded messages: bytes, encode, decode, and the bandwidth below which coding pays.
+
+    Exit status 1 if what is decoded is not what was coded.
+
+    Example: `splatpipe bench messages configs/demo.toml survey.scene --json messages.json`
+    """
+    from .bench.messages import bench_messages as measure
+    from .bench.messages import print_messages
+
+    results = measure(inputs, sets or [], frames=frames, ranks=ranks, repeats=repeats)
+    _report(results, print_messages, json)
+    raise typer.Exit(int(any(row["failed"] for row in results["rows"])))
 
 
 @bench_app.command("lod")

@@ -12,7 +12,8 @@ message            from → to                     payload
 ``SceneOffer``     sampling → render             ``scene.json`` and the colour mode
 ``SceneRequest``   render → sampling             array, first byte, number of bytes; nothing: no more is needed
 ``SceneBytes``     sampling → render             the bytes asked for, as they are stored
-``Framebuffer``    render → render               words of pixels, by runs (``framebuffer_runs``)
+``Framebuffer``    render → render               words of pixels, by runs (``framebuffer_runs``); none: background
+``FilmPicture``    render → rank 0               8-bit red, green, blue of each pixel
 =================  ============================  ============================================================
 
 Those of scenes cross before the first frame, where ``scene.delivery`` is ``messages``. Their header has the number of
@@ -22,7 +23,8 @@ Protocol versions
     1. The first.
     2. Scenes by messages.
     3. Framebuffers.
-    4. Frames start by a plan; notes of plans and of stage times.
+    4. Frames start by a plan; notes of plans and of stage times; pictures of films; coded payloads
+       (``message_codecs``).
 """
 
 from __future__ import annotations
@@ -41,6 +43,8 @@ from .scene_info import MAX_INFO_BYTES, SceneInfo, info_from_json
 MAGIC = b"SPLT"
 PROTOCOL_VERSION = 4
 HEADER = struct.Struct("<4sHHQQ")
+CODED = 0x8000
+"""Bit of a header's kind that says that the payload is coded (``message_codecs``)."""
 _FRAME_START = struct.Struct("<16d3d2IdI")
 _SCENE_REQUEST = struct.Struct("<IIQ")
 _MAX_COLOUR_BYTES = 64
@@ -73,7 +77,8 @@ class Kind(IntEnum):
     SCENE_BYTES = 8
     FRAMEBUFFER = 9
     PLAN = 10
-    STAGE_TIMES = 11
+    FILM_PICTURE = 11
+    STAGE_TIMES = 12
 
 
 @dataclass(frozen=True)
@@ -175,12 +180,27 @@ class Framebuffer:
     runs: np.ndarray
 
 
-Message = FrameStart | VisibilityBits | RenderPoints | SceneOffer | SceneRequest | SceneBytes | Framebuffer
+@dataclass(frozen=True)
+class FilmPicture:
+    """A picture of a film. frame : number of the picture.  rgb : (h, w, 3) uint8."""
+
+    frame: int
+    rgb: np.ndarray
 
 
-def header(kind: Kind, frame: int, length: int) -> bytes:
+Message = (
+    FrameStart | VisibilityBits | RenderPoints | SceneOffer | SceneRequest | SceneBytes | Framebuffer | FilmPicture
+)
+
+
+def header(kind: Kind, frame: int, length: int, *, coded: bool = False) -> bytes:
     """The 24 bytes in front of a payload."""
-    return HEADER.pack(MAGIC, PROTOCOL_VERSION, kind, frame, length)
+    return HEADER.pack(MAGIC, PROTOCOL_VERSION, kind | CODED * coded, frame, length)
+
+
+def is_coded(head: bytes | bytearray | memoryview) -> bool:
+    """Whether the payload behind a header that ``parse_header`` has taken is coded."""
+    return bool(HEADER.unpack_from(head)[2] & CODED)
 
 
 def parse_header(data: bytes | memoryview) -> tuple[Kind, int, int]:
@@ -193,7 +213,7 @@ def parse_header(data: bytes | memoryview) -> tuple[Kind, int, int]:
     if version != PROTOCOL_VERSION:
         raise MessageError(f"message header: found protocol {version}, expected {PROTOCOL_VERSION}")
     try:
-        return Kind(kind), frame, length
+        return Kind(kind & ~CODED), frame, length
     except ValueError:
         raise MessageError(f"message header: found kind {kind}, expected one of {[int(k) for k in Kind]}") from None
 
@@ -232,6 +252,9 @@ def encode(message: Message) -> tuple[bytes, memoryview]:
         case Framebuffer():
             payload = np.ascontiguousarray(message.runs).data
             return header(Kind.FRAMEBUFFER, message.frame, len(payload)), payload
+        case FilmPicture():
+            payload = np.ascontiguousarray(message.rgb).reshape(-1).data
+            return header(Kind.FILM_PICTURE, message.frame, len(payload)), payload
 
 
 Bytes = bytes | bytearray | memoryview

@@ -282,6 +282,9 @@ def test_what_can_be_balanced(layout, expected):
     assert bool(make_policies(layout, [np.ones(64)] * len(layout.lanes), 10, 10)) is expected
     assert is_on(PipelineSection(balance="measured"), layout) is expected
     assert not is_on(PipelineSection(balance="off"), layout)
+    if layout.split == "tiles":
+        assert not can_balance(layout, tiles_stay=True)
+        assert not make_policies(layout, [np.ones(64)] * len(layout.lanes), 10, 10, tiles_stay=True)
 
 
 # --- notes -------------------------------------------------------------------------------------------------------

@@ -49,12 +49,12 @@ class Policy(Protocol):
         ...
 
 
-def can_balance(layout: Layout) -> bool:
-    """Whether there are parts between which a border can move."""
+def can_balance(layout: Layout, tiles_stay: bool = False) -> bool:
+    """Whether there are parts between which a border can move. tiles_stay : they are the screens of a wall."""
     parts = max(len(ranks) for lane in layout.lanes for ranks in (lane.culling, lane.sampling))
-    return parts > 1 or (layout.split == "tiles" and len(layout.render) > 1)
+    return parts > 1 or (layout.split == "tiles" and len(layout.render) > 1 and not tiles_stay)
 
 
-def is_on(pipeline: PipelineSection, layout: Layout) -> bool:
+def is_on(pipeline: PipelineSection, layout: Layout, tiles_stay: bool = False) -> bool:
     """Whether a run of this layout is balanced."""
-    return pipeline.balance == "measured" and can_balance(layout)
+    return pipeline.balance == "measured" and can_balance(layout, tiles_stay)

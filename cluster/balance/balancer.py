@@ -121,10 +121,13 @@ class Balancer:
             last["imbalance_after"] = imbalance(parts)
 
 
-def make_policies(layout: Layout, cells: Sequence[np.ndarray], width: int, height: int) -> list[Policy]:
+def make_policies(
+    layout: Layout, cells: Sequence[np.ndarray], width: int, height: int, tiles_stay: bool = False
+) -> list[Policy]:
     """What may be moved in a layout.
 
     cells : by lane, number of cells of each of its subtrees.  width, height : of the picture, pixels.
+    tiles_stay : they are the screens of a wall.
     """
     policies: list[Policy] = []
     for i, lane in enumerate(layout.lanes):
@@ -136,7 +139,7 @@ def make_policies(layout: Layout, cells: Sequence[np.ndarray], width: int, heigh
                 for stage in ("culling", "sampling")
                 if len(getattr(lane, stage)) > 1
             ]
-    if layout.split == "tiles" and len(layout.render) > 1:
+    if layout.split == "tiles" and len(layout.render) > 1 and not tiles_stay:
         policies.append(TileBorders(layout, width, height))
     return policies
 

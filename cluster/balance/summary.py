@@ -15,7 +15,9 @@ ENDS = 16
 """Frames at the beginning and at the end of a run that are looked at apart."""
 
 
-def balance_record(layout: Layout, told: Sequence[Mapping[str, Any]], balancer: Balancer | None) -> dict[str, Any]:
+def balance_record(
+    layout: Layout, told: Sequence[Mapping[str, Any]], balancer: Balancer | None, tiles_stay: bool = False
+) -> dict[str, Any]:
     """JSON-able.
 
     told : of each rank, ``taken_s`` by stage, seconds of each frame as they are balanced by, and ``adopting_s`` of each
@@ -30,7 +32,7 @@ def balance_record(layout: Layout, told: Sequence[Mapping[str, Any]], balancer: 
     busy = np.array([np.sum(list(of.values()), axis=0) for of in taken_s.values()])
     n = busy.shape[1]
     uneven = {}
-    for policy in make_policies(layout, [np.ones(1)] * len(layout.lanes), 1, 1):  # for their parts alone
+    for policy in make_policies(layout, [np.ones(1)] * len(layout.lanes), 1, 1, tiles_stay):  # for their parts alone
         each = [imbalance(policy.parts(_medians(taken_s, slice(i, i + 1)))) for i in range(n)]
         uneven[policy.name] = {
             "first": imbalance(policy.parts(_medians(taken_s, slice(0, ENDS)))),
