@@ -509,7 +509,7 @@ def bench_balance(
     sets: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a key.")] = None,
     points: Annotated[int, typer.Option(help="Number of points.", min=1000)] = 4_000_000,
     share: Annotated[float, typer.Option(help="Share of them in one octant.", min=0, max=1)] = 0.9,
-    per_cell: Annotated[int, typer.Option(help="Most points of a leaf of the octree.", min=1)] = 10_000,
+    per_cell: Annotated[int, typer.Option(help="Most points of a leaf of the octree.", min=1)] = 4096,
     size: Annotated[str, typer.Option(metavar="WIDTHxHEIGHT", help="Viewport, pixels.")] = "1280x720",
     frames: Annotated[int, typer.Option(help="Frames of the round that the camera makes.", min=1)] = 240,
     repeats: Annotated[int, typer.Option(help="Runs of each.", min=1)] = 3,
