@@ -502,6 +502,42 @@ def bench_pipeline(
     _report(measure(config, sets or [], repeats), print_pipeline, json)
 
 
+@bench_app.command("balance")
+def bench_balance(
+    topology: Annotated[str, typer.Option(help="One that has something to move.")] = "sort-first-only",
+    ranks: Annotated[int, typer.Option(help="Number of ranks.", min=2)] = 2,
+    sets: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a key.")] = None,
+    points: Annotated[int, typer.Option(help="Number of points.", min=1000)] = 4_000_000,
+    share: Annotated[float, typer.Option(help="Share of them in one octant.", min=0, max=1)] = 0.9,
+    size: Annotated[str, typer.Option(metavar="WIDTHxHEIGHT", help="Viewport, pixels.")] = "1280x720",
+    frames: Annotated[int, typer.Option(help="Frames of the round that the camera makes.", min=1)] = 240,
+    repeats: Annotated[int, typer.Option(help="Runs of each.", min=1)] = 3,
+    workdir: Annotated[Path, typer.Option(help="Where the scene is built and kept.")] = Path("bench-balance"),
+    json: JsonOption = None,
+) -> None:
+    """Load balance off against measured, on a scene with one hot octant and a moving camera.
+
+    Example: `splatpipe bench balance --ranks 4 --points 1000000 --json balance.json`
+    """
+    from .bench.balance import bench_balance as measure
+    from .bench.balance import print_balance
+
+    width, height = map(int, parse_numbers(size.replace("x", ","), "--size", 2))
+    results = measure(
+        topology,
+        ranks,
+        sets or [],
+        n_points=points,
+        share=share,
+        width=width,
+        height=height,
+        frames=frames,
+        repeats=repeats,
+        workdir=workdir,
+    )
+    _report(results, print_balance, json)
+
+
 @bench_app.command("compositing")
 def bench_compositing(
     ranks: Annotated[str, typer.Option(metavar="N,N,…", help="Numbers of ranks, each at least 2.")] = "2,4",

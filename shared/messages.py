@@ -23,7 +23,8 @@ Protocol versions
     1. The first.
     2. Scenes by messages.
     3. Framebuffers.
-    4. Frames start by a plan; pictures of films; coded payloads (``message_codecs``).
+    4. Frames start by a plan; notes of plans and of stage times; pictures of films; coded payloads
+       (``message_codecs``).
 """
 
 from __future__ import annotations
@@ -77,6 +78,7 @@ class Kind(IntEnum):
     FRAMEBUFFER = 9
     PLAN = 10
     FILM_PICTURE = 11
+    STAGE_TIMES = 12
 
 
 @dataclass(frozen=True)
