@@ -33,6 +33,7 @@ app.add_typer(layer_app, name="layer")
 CellInputs = Annotated[
     list[str] | None, typer.Argument(help="Scenes, point files, folders or globs; default: a generated surface.")
 ]
+RanksOption = Annotated[int, typer.Option(help="Build on so many MPI ranks, started here; 0: without MPI.", min=0)]
 JsonOption = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write what was measured.")]
 
 
@@ -94,9 +95,12 @@ def build(
     n_pools: Annotated[int, typer.Option(help="Pools: most of a cell.")] = 2,
     strict: Annotated[bool, typer.Option(help="Refuse points that are not finite instead of dropping them.")] = False,
     overwrite: Annotated[bool, typer.Option(help="Replace an existing scene.")] = False,
+    ranks: RanksOption = 0,
     json: JsonOption = None,
 ) -> None:
     """Build a scene from point files, larger than memory if need be.
+
+    `mpirun -n N splatpipe build …` shares the work among ranks that see the same folders; so does `--ranks N`.
 
     Example: `splatpipe build 'survey/*.laz' -o survey.scene --memory 8GB`
     """
@@ -124,7 +128,7 @@ def build(
         strict=strict,
         overwrite=overwrite,
     )
-    build_command(inputs, output, settings, json)
+    raise typer.Exit(build_command(inputs, output, settings, json, ranks))
 
 
 @app.command()
@@ -136,6 +140,7 @@ def synth(
     features: Annotated[bool, typer.Option("--features", help="As for `splatpipe build`.")] = False,
     pools: Annotated[bool, typer.Option("--pools", help="As for `splatpipe build`.")] = False,
     overwrite: Annotated[bool, typer.Option(help="Replace an existing scene.")] = False,
+    ranks: RanksOption = 0,
 ) -> None:
     """Make a synthetic city scan: a scene directory, or a LAS/LAZ file.
 
@@ -145,7 +150,7 @@ def synth(
     from .scenes import synth_command
 
     settings = BuildSettings(overwrite=overwrite, up="z", splats=splats, features=features, pools=pools)
-    synth_command(output, points, seed, settings)
+    raise typer.Exit(synth_command(output, points, seed, settings, ranks))
 
 
 @app.command()

@@ -37,6 +37,12 @@ def inside_mpi() -> bool:
     return any(name in os.environ for name in _WORLD_VARIABLES)
 
 
+def world_size() -> int | None:
+    """How many ranks the ``mpiexec`` has started that started this one, where it says so: whichever MPI it is of."""
+    sizes = (os.environ.get(name, "") for name in ("PMI_SIZE", "OMPI_COMM_WORLD_SIZE"))
+    return next((int(size) for size in sizes if size.isdigit()), None)
+
+
 def mpi_available() -> bool:
     """Whether mpi4py and an ``mpiexec`` are installed. Imports neither."""
     return importlib.util.find_spec("mpi4py") is not None and find_mpiexec() is not None

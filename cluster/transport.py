@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import json
 import math
+import threading
 import time
 from collections import defaultdict, deque
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -50,6 +52,7 @@ class Transport:
         self._comm = MPI.COMM_WORLD.Dup()
         self.rank: int = self._comm.Get_rank()
         self.size: int = self._comm.Get_size()
+        self._any_thread = MPI.Query_thread() >= MPI.THREAD_SERIALIZED
         self.library = MPI.Get_library_version().splitlines()[0].strip("\0 ")
         self.timeout_s = timeout_s
         self._depth = depth
@@ -102,6 +105,10 @@ class Transport:
         """Whether a message of a kind waits to be received. Cost: one probe."""
         return bool(self._comm.Iprobe(source, int(kind)))
 
+    def may_talk(self) -> bool:
+        """Whether the thread that asks may send and receive: any, one at a time, where MPI allows it."""
+        return self._any_thread or threading.current_thread() is threading.main_thread()
+
     def agree(self, status: int) -> list[int]:
         """The status, or another small number, of every rank. Collective."""
         statuses = np.empty(self.size, np.int32)
@@ -114,6 +121,19 @@ class Transport:
         joined = np.empty(sum(counts))
         self._comm.Allgatherv(np.ascontiguousarray(values, np.float64), [joined, counts])
         return joined
+
+    def total(self, counts: np.ndarray) -> np.ndarray:
+        """Int64 sums over all ranks of an array that has the same shape on each. Collective."""
+        sums = np.empty_like(counts)
+        self._comm.Allreduce(np.ascontiguousarray(counts), sums)
+        return sums
+
+    def tell(self, data: bytes) -> bytes:
+        """The bytes that rank 0 gives. Collective."""
+        (length,) = self.agree(len(data))[:1]
+        buffer = bytearray(data) if self.rank == 0 else bytearray(length)
+        self._comm.Bcast([buffer, self._mpi.BYTE], 0)
+        return bytes(buffer)
 
     def ranks_here(self) -> int:
         """How many ranks share this rank's host. Collective."""
@@ -138,10 +158,15 @@ class Transport:
         """Messages and bytes (headers included) this rank has sent, by kind."""
         return {kind: {"count": self._count[kind], "bytes": n} for kind, n in self._bytes.items()}
 
-    def meet(self) -> None:
-        """Wait, however long it takes, until every rank is here: loading a scene has no time limit. Collective."""
+    def meet(self, meanwhile: Callable[[], None] | None = None) -> None:
+        """Wait, however long it takes, until every rank is here: loading a scene has no time limit. Collective.
+
+        meanwhile : called time and again while this rank waits.
+        """
         request = self._comm.Ibarrier()
         while not request.Test():
+            if meanwhile is not None:
+                meanwhile()
             time.sleep(_SLEEP_S[1])
 
     def finish(self) -> None:

@@ -70,6 +70,7 @@ class Kind(IntEnum):
     SCENE_REQUEST = 7
     SCENE_BYTES = 8
     FRAMEBUFFER = 9
+    BUILD = 32
 
 
 @dataclass(frozen=True)
