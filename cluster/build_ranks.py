@@ -18,6 +18,7 @@ from ..shared.build.on_ranks import build_scene_on_ranks
 from ..shared.build.ranks import FailedElsewhere, step
 from ..shared.errors import InputError, SplatpipeError
 from ..shared.messages import Kind
+from ..shared.readers.described import DescribedSource, described
 from ..shared.readers.source import Source
 from .launch import EXPECTED_RANKS, launch, mpi_available, record, say_failed, world_size
 from .progress import FrameProgress
@@ -83,14 +84,7 @@ def build_on_ranks(
             )
         with FrameProgress(None, on_terminal=transport.rank == 0) as progress:
             ranks = MpiRanks(transport, progress)
-            told = ""
-            with step(ranks):
-                if ranks.rank == 0:
-                    told = json.dumps(names())
-            found = json.loads(ranks.tell(told.encode()))
-            sources: list[Source] = []
-            with step(ranks):
-                sources = [open_named(name) for name in found]
+            sources = _open_together(ranks, names, open_named)
             report = build_scene_on_ranks(sources, output, ranks, settings=settings, progress=ranks.show)
         if report is not None:
             tell(report)
@@ -109,6 +103,27 @@ def build_on_ranks(
         time.sleep(0.2)  # so that the line is relayed before mpiexec tears everything down
         transport.abort(1)
     return 0
+
+
+def _open_together(
+    ranks: MpiRanks, names: Callable[[], list[str]], open_named: Callable[[str], Source]
+) -> list[Source]:
+    """The sources that rank 0 names; of several, each rank opens some and tells the others what they say."""
+    told = ""
+    with step(ranks):
+        if ranks.rank == 0:
+            told = json.dumps(names())
+    found = json.loads(ranks.gather(told.encode())[0])
+    own = range(ranks.rank, len(found), ranks.size) if len(found) > 1 else range(len(found))
+    opened: dict[int, Source] = {}
+    with step(ranks):
+        opened = {i: open_named(found[i]) for i in own}
+    if len(found) == 1:
+        return list(opened.values())
+    said: dict[str, Any] = {}
+    for part in ranks.gather(json.dumps({i: described(source) for i, source in opened.items()}).encode()):
+        said |= json.loads(part)
+    return [opened.get(i) or DescribedSource(said[str(i)], open_named) for i in range(len(found))]
 
 
 def _named(rank: int, why: str) -> str:
@@ -150,9 +165,9 @@ class MpiRanks:
         """Sums over all ranks."""
         return self._met().total(counts)
 
-    def tell(self, data: bytes) -> bytes:
-        """The bytes of rank 0."""
-        return self._met().tell(data)
+    def gather(self, data: bytes) -> list[bytes]:
+        """The bytes of each rank."""
+        return self._met().gather(data)
 
     def warn(self) -> None:
         """Tell the others that this rank has failed."""

@@ -128,12 +128,13 @@ class Transport:
         self._comm.Allreduce(np.ascontiguousarray(counts), sums)
         return sums
 
-    def tell(self, data: bytes) -> bytes:
-        """The bytes that rank 0 gives. Collective."""
-        (length,) = self.agree(len(data))[:1]
-        buffer = bytearray(data) if self.rank == 0 else bytearray(length)
-        self._comm.Bcast([buffer, self._mpi.BYTE], 0)
-        return bytes(buffer)
+    def gather(self, data: bytes) -> list[bytes]:
+        """The bytes that each rank gives, below 2 GiB together. Collective."""
+        lengths = self.agree(len(data))
+        joined = bytearray(sum(lengths))
+        self._comm.Allgatherv([data, self._mpi.BYTE], [joined, lengths, None, self._mpi.BYTE])
+        ends = np.cumsum(lengths).tolist()
+        return [bytes(joined[end - n : end]) for end, n in zip(ends, lengths, strict=True)]
 
     def ranks_here(self) -> int:
         """How many ranks share this rank's host. Collective."""

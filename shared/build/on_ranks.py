@@ -151,7 +151,7 @@ class _SharedBuild(Build):
                 token = secrets.token_hex(16)
                 with writing(self.partial):
                     (self.partial / _TOKEN).write_text(token)
-        token = self.ranks.tell(token.encode()).decode()
+        token = self.ranks.gather(token.encode())[0].decode()
         with self.step():
             if self.scene is not None:
                 self.writer = self.scene
@@ -225,7 +225,7 @@ class _SharedBuild(Build):
             if self.is_first:  # may read runs, where points crowd
                 cells = [(p.level, p.code, p.n_points, p.fits) for p in runs.partitions(capacity, wanted)]
                 found = np.array(cells, np.int64)
-        found = np.frombuffer(self.ranks.tell(found.tobytes()), np.int64).reshape(-1, 4)
+        found = np.frombuffer(self.ranks.gather(found.tobytes())[0], np.int64).reshape(-1, 4)
         own = consecutive(found[:, 2], self.ranks.rank, self.ranks.size)
         return [Partition(level, code, n, bool(fits)) for level, code, n, fits in found[own].tolist()]
 

@@ -41,8 +41,8 @@ class Ranks(Protocol):
         """Int64 sums over all ranks of an array that has the same shape on each."""
         ...
 
-    def tell(self, data: bytes) -> bytes:
-        """The bytes that rank 0 gives; those of other ranks are passed over."""
+    def gather(self, data: bytes) -> list[bytes]:
+        """The bytes that each rank gives."""
         ...
 
     def warn(self) -> None:
