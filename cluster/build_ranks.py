@@ -147,6 +147,7 @@ class MpiRanks:
         self._next_note = 0.0
         self._failed = False
         self._stage = "starting"
+        self._told: dict[str, Any] = {}
         self._done: dict[str, dict[int, tuple[int, int | None]]] = {}  # stage → rank → points done, and in all
 
     def ranks_here(self) -> int:
@@ -198,12 +199,14 @@ class MpiRanks:
             for rank in range(self.size):
                 while rank != self.rank and self._transport.has_note(rank, Kind.BUILD):
                     self._take(rank, self._transport.receive_note(rank, Kind.BUILD)[1])
-            if self.rank:
+            if not self.rank:
+                self._show()
+            elif self._transport.idle(0):  # notes must not pile up where rank 0 has no time for them
                 done, total = self._done.get(self._stage, {}).get(self.rank, (0, None))
                 note = {"stage": self._stage, "done": done, "total": total}
-                self._transport.send_note(0, Kind.BUILD, 0, note)
-            else:
-                self._show()
+                if note != self._told:
+                    self._transport.send_note(0, Kind.BUILD, 0, note)
+                    self._told = note
         finally:
             self._talking.release()
 

@@ -474,17 +474,18 @@ def bench_budget(
 def bench_build(
     points: Annotated[int, typer.Option(help="Number of points of the LAS file.", min=1000)] = 20_000_000,
     repeats: Annotated[int, typer.Option(help="Timed builds.", min=1)] = 3,
+    ranks: Annotated[int, typer.Option(help="Also on so many MPI ranks of this host; 0: not.", min=0)] = 0,
     workdir: Annotated[Path | None, typer.Option(help="Where the file and the scenes go.")] = None,
     json: JsonOption = None,
 ) -> None:
-    """LAS file → scene: points per second and peak memory, in memory and external.
+    """LAS file → scene: points per second and peak memory, in memory, external and on MPI ranks.
 
-    Example: `splatpipe bench build --points 20000000 --json build.json`
+    Example: `splatpipe bench build --points 20000000 --ranks 2 --json build.json`
     """
     from .bench.build import bench_build as measure
     from .bench.build import print_build
 
-    _report(measure(n_points=points, repeats=repeats, workdir=workdir), print_build, json)
+    _report(measure(n_points=points, repeats=repeats, ranks=ranks, workdir=workdir), print_build, json)
 
 
 @bench_app.command("pipeline")

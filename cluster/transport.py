@@ -155,6 +155,13 @@ class Transport:
         if not serve:
             self._comm.Send(buffer, peer)
 
+    def idle(self, dest: int) -> bool:
+        """Whether all that was sent to a rank has gone."""
+        queue = self._under_way[dest]
+        while queue and self._mpi.Request.Testall(queue[0][0]):
+            queue.popleft()
+        return not queue
+
     def traffic(self) -> dict[str, dict[str, int]]:
         """Messages and bytes (headers included) this rank has sent, by kind."""
         return {kind: {"count": self._count[kind], "bytes": n} for kind, n in self._bytes.items()}
@@ -199,9 +206,8 @@ class Transport:
         return [body[i : i + self._piece_bytes] for i in range(0, len(body), self._piece_bytes)]
 
     def _drain(self, dest: int, at_most: int) -> None:
+        self.idle(dest)  # takes out what has gone
         queue = self._under_way[dest]
-        while queue and self._mpi.Request.Testall(queue[0][0]):
-            queue.popleft()
         while len(queue) > at_most:
             self._wait(queue[0][0], dest, "a message sent to it to be taken", self.timeout_s)
             queue.popleft()

@@ -12,6 +12,7 @@ of ``build_scene``. Ranks exchange counts and bounds in messages, points and cel
 
 from __future__ import annotations
 
+import json
 import os
 import secrets
 import shutil
@@ -104,8 +105,7 @@ class _SharedBuild(Build):
     def run_on_ranks(self, stack: ExitStack) -> BuildReport | None:
         """The whole build; ``stack`` closes what it opens."""
         self.open_folder(stack)
-        n_threads = self.settings.threads or len(os.sched_getaffinity(0))
-        self.workers = stack.enter_context(Workers(max(1, n_threads // self.ranks_here)))
+        self.workers = stack.enter_context(Workers(self.threads_of_rank()))
         with self.timed("read"):
             runs, tally = self.read_shares()
         with self.step():
@@ -125,13 +125,20 @@ class _SharedBuild(Build):
         with self.step():
             if self.is_first:
                 assert self.scene is not None
-                self.workers = stack.enter_context(Workers(n_threads))  # the other ranks only wait from here on
+                self.workers = stack.enter_context(Workers(self.settings.threads))  # the other ranks only wait now
                 with self.timed("write"):
                     self.assembly.append_top(self.array, self.workers)
                 with self.timed("finish"):
                     info = self.finish(self.scene, origin, edge, tally)
                 report = self.report(info, int(spilled.sum()), int(peaks.max()), self.ranks.size)
         return report
+
+    def threads_of_rank(self) -> int:
+        """A rank's part of the threads of its host: of all cores that its ranks may run on, bound to some or not."""
+        own = {"host": socket.gethostname(), "cores": sorted(os.sched_getaffinity(0))}
+        told = [json.loads(rank) for rank in self.ranks.gather(json.dumps(own).encode())]
+        cores = {core for rank in told if rank["host"] == own["host"] for core in rank["cores"]}
+        return max(1, (self.settings.threads or len(cores)) // self.ranks_here)
 
     def step(self) -> AbstractContextManager[None]:
         return step(self.ranks)
