@@ -9,7 +9,7 @@ sort_last, compositing/  each rank draws a share of the points; framebuffers mee
 transport, launch        messages between ranks; starting ranks, and who died
 delivery                 a scene's arrays sent to the render rank
 sink, progress, record   outputs; progress bars; what a run says about itself
-scenes                   build, synth, info, verify
+scenes, build_ranks      build, synth, info, verify; building on several ranks
 layers/                  layer: files → layers of objects
 plan/                    what a run needs and what it leaves out; one rank or three
 model/                   the parameters and inequalities of the thesis

@@ -41,6 +41,8 @@ def synth_command(output: Path, n_points: int, seed: int, settings: BuildSetting
 
     if output.suffix.lower() not in (".las", ".laz"):
         return _build(lambda: ["city"], lambda _: CityScan(n_points, seed), output, settings, None, n_ranks)
+    if n_ranks > 1 or inside_mpi():
+        raise InputError(f"{output}: a point file is written by one process, expected a scene, or no ranks")
     if output.exists() and not settings.overwrite:
         raise InputError(f"{output}: exists already; --overwrite replaces it")
     write_las(CityScan(n_points, seed), output)

@@ -13,6 +13,7 @@ message            from → to                     payload
 ``SceneRequest``   render → sampling             array, first byte, number of bytes; nothing: no more is needed
 ``SceneBytes``     sampling → render             the bytes asked for, as they are stored
 ``Framebuffer``    share → share                 words of pixels, by runs (``framebuffer_runs``)
+``Build``          any → any                     JSON: how far a rank is with its part of a build, or that it failed
 =================  ============================  ============================================================
 
 Those of scenes cross before the first frame, where ``scene.delivery`` is ``messages``. Their header has the number of

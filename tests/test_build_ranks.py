@@ -57,6 +57,8 @@ def cloud(kind, n, seed=0):
         case "surface":
             positions = rng.normal(size=(n, 3))
             positions /= np.linalg.norm(positions, axis=1)[:, None]
+        case "lattice":
+            positions = np.column_stack([np.arange(n) % 40, np.arange(n) // 40 % 40, np.full(n, seed)]) * 0.5
         case "coincident":
             positions = np.full((n, 3), 3.25)
             positions[: n // 10] = rng.uniform(0, 8, (n // 10, 3))
@@ -153,11 +155,17 @@ def test_dropped_points_are_counted_over_all_ranks(tmp_path):
     "options", [{"positions": "occupancy"}, {"positions": "ci", "position_bits": 6, "point_order": "depth-first"}]
 )
 def test_coded_positions_and_pools_are_those_of_one_process(tmp_path, options):
-    sources = several_sources("surface")
-    options = {"points_per_cell": 256, "pools": True, "pool_bits": 4} | options
+    sources = several_sources("lattice")
+    options = {"points_per_cell": 512, "pools": True, "pool_bits": 5} | options
     build_scene(sources, tmp_path / "one", settings=BuildSettings(**options))
-    build_together(sources, tmp_path / "together", 3, **options)
-    assert cells_of(tmp_path / "together") == cells_of(tmp_path / "one")
+    for size in (1, 3):
+        build_together(sources, tmp_path / str(size), size, **options)
+    assert cells_of(tmp_path / "3") == cells_of(tmp_path / "one")
+    one, three = bytes_of(tmp_path / "one"), bytes_of(tmp_path / "3")
+    assert np.load(tmp_path / "one" / "cell_pool_bytes.npy").any()
+    for name in ("cell_pool_bytes", "cell_pool_points", "cell_position_bytes"):
+        assert one[f"{name}.npy"] == three[f"{name}.npy"]
+    assert three == bytes_of(tmp_path / "1")
 
 
 def test_features_and_radii_are_the_same_for_any_number_of_ranks(tmp_path):
@@ -335,6 +343,12 @@ def test_ranks_that_the_command_starts_build_the_scene_of_one(survey):
     assert done.stdout.startswith(f"wrote {survey / 's'}: 80,000 points")
     assert cells_of(survey / "s") == cells_of(survey / "one")
     assert '"n_ranks": 3' in (survey / "s.json").read_text()
+
+
+def test_ranks_do_not_write_point_files(tmp_path):
+    done = call(*SPLATPIPE, "synth", tmp_path / "a.las", "--points", 1000, "--ranks", 2)
+    assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
+    assert "a point file is written by one process" in done.stderr
 
 
 @needs_mpi

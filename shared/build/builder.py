@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -69,6 +69,20 @@ def silent(stage: str, done: int, total: int | None) -> None:
     """Progress that nobody looks at."""
 
 
+Arrays = dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Finished:
+    """The cells of a scene whose points are all stored: name → array, the root cube, and the blocks."""
+
+    cells: Arrays
+    origin: np.ndarray
+    edge: float
+    block_first_point: np.ndarray
+    block_origin: np.ndarray
+
+
 class Build:
     """One build: reading, partitions, the cells above them, ``scene.json``.
 
@@ -87,11 +101,11 @@ class Build:
         self.share = sources  # what this process reads of them
         self.read_attributes, self.attributes, self.dropped_attributes = planned_attributes(sources, settings)
         self.makes = set(self.attributes) - set(self.read_attributes)
-        budget = settings
+        self.budget = settings  # with the memory of this process
         if ranks_here > 1:
             memory_bytes = settings.memory_bytes or available_memory_bytes() // 2
-            budget = replace(settings, memory_bytes=max(1, memory_bytes // ranks_here))
-        self.memory: MemoryPlan = plan_memory(budget, self.attributes, bool(self.makes))
+            self.budget = replace(settings, memory_bytes=max(1, memory_bytes // ranks_here))
+        self.memory: MemoryPlan = plan_memory(self.budget, self.attributes, bool(self.makes))
         self.rule = Subdivision(settings.points_per_cell, settings.max_depth, settings.flatness)
         self.declared = declared_bounds(sources)
         self.stage_s: dict[str, float] = {}
@@ -116,7 +130,10 @@ class Build:
             with self.timed("write"):
                 self.assembly.append_top(self.array, self.workers)
             with self.timed("finish"):
-                info = self.finish(writer, origin, edge, tally)
+                finished = self.finish_cells(writer, origin, edge, tally)
+                if self.settings.pools:
+                    finished.cells.update(self.pool(finished, [writer.written(axis) for axis in "xyz"]))
+                info = self.commit(writer, finished, tally)
         return self.report(info, runs.bytes if runs else 0, peak_resident_bytes())
 
     def prepare(self, bounds: Bounds) -> tuple[np.ndarray, float]:
@@ -264,13 +281,11 @@ class Build:
             center=bounds[0] + (bounds[1] - bounds[0]) / 2,
         )
 
-    def finish(self, writer: SceneWriter, origin: np.ndarray, edge: float, tally: Tally) -> SceneInfo:
-        """Write the cells, the blocks and ``scene.json``, and put the scene in its place."""
+    def finish_cells(self, writer: SceneWriter, origin: np.ndarray, edge: float, tally: Tally) -> Finished:
+        """The cells, and what is made of them but for pools."""
         cells = self.assembly.cell_arrays("normal" in self.attributes)
         first, block_origin = self.array.blocks()
-        position_bytes = pool_bytes = pool_bits = 0
-        coded = self.settings.positions != "float32"
-        if coded:
+        if self.settings.positions != "float32":
             with self.timed("positions"):
                 cells |= code_positions(
                     cells,
@@ -285,36 +300,53 @@ class Build:
                     self.workers,
                     lambda done, total: self.progress("positions", done, total),
                 )
-                position_bytes = int(cells["cell_position_bytes"].sum(dtype=np.int64))
         if self.settings.features:
             with self.timed("features"):
                 cells |= cell_features(cells, origin, edge, first, block_origin, writer.written, self.workers)
-        if self.settings.pools:
-            with self.timed("pools"):
-                pool_bits = self.settings.pool_bits or suited_bits(self.settings.points_per_cell)
-                x, y, z = (writer.written(name) for name in "xyz")
-                cells |= pool_positions(
-                    cells,
-                    origin,
-                    edge,
-                    first,
-                    block_origin,
-                    lambda begin, end: (x[begin:end], y[begin:end], z[begin:end]),
-                    pool_bits,
-                    self.settings,
-                    writer,
-                    self.workers,
-                    lambda done, total: self.progress("pools", done, total),
-                )
-                pool_bytes = int(cells["cell_pool_bytes"].sum(dtype=np.int64))
+        return Finished(cells, origin, edge, first, block_origin)
+
+    def pool(self, finished: Finished, columns: list[np.ndarray], share: tuple[int, int] = (0, 1)) -> Arrays:
+        """Write the pooled form of a share of the cells; what it adds to them. columns : x, y and z of all points."""
+        x, y, z = columns
+        with self.timed("pools"):
+            return pool_positions(
+                finished.cells,
+                finished.origin,
+                finished.edge,
+                finished.block_first_point,
+                finished.block_origin,
+                lambda begin, end: (x[begin:end], y[begin:end], z[begin:end]),
+                self.pool_bits,
+                self.budget,
+                self.writer,
+                self.workers,
+                lambda done, total: self.progress("pools", done, total),
+                share=share,
+            )
+
+    @property
+    def pool_bits(self) -> int:
+        """Bits an axis of the pooled form's grid; 0 without one."""
+        if not self.settings.pools:
+            return 0
+        return self.settings.pool_bits or suited_bits(self.settings.points_per_cell)
+
+    def commit(self, writer: SceneWriter, finished: Finished, tally: Tally) -> SceneInfo:
+        """Write the cells, the blocks and ``scene.json``, and put the scene in its place."""
+        cells, first = finished.cells, finished.block_first_point
+        coded = self.settings.positions != "float32"
         for axis in "xyz" if coded else "":
             writer.drop(axis)
-        for name, values in {**cells, "block_first_point": first, "block_origin": block_origin}.items():
+        for name, values in {**cells, "block_first_point": first, "block_origin": finished.block_origin}.items():
             writer.write_array(name, values)
+
+        def bytes_of(name: str) -> int:
+            return int(cells[name].sum(dtype=np.int64)) if name in cells else 0
+
         info = SceneInfo(
             point_order=self.settings.point_order,
-            origin=_triple(origin),
-            edge=edge,
+            origin=_triple(finished.origin),
+            edge=finished.edge,
             lower=_triple(tally.lower),
             upper=_triple(tally.upper),
             n_points=tally.n_points,
@@ -326,9 +358,9 @@ class Build:
             features=self.settings.features,
             positions=self.settings.positions,
             position_bits=self.settings.position_bits if coded else 0,
-            position_bytes=position_bytes,
-            pool_bits=pool_bits,
-            pool_bytes=pool_bytes,
+            position_bytes=bytes_of("cell_position_bytes"),
+            pool_bits=self.pool_bits,
+            pool_bytes=bytes_of("cell_pool_bytes"),
             block_levels=block_levels_of(self.settings.point_order, self.settings.points_per_cell),
             up=self.settings.up,
             crs=next((s.info.crs for s in self.sources if s.info.crs), None),

@@ -27,7 +27,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..readers.source import Source
-from .builder import Build, Progress, silent
+from .builder import Build, Finished, Progress, silent
 from .ingest import Bounds, Tally, root_bounds
 from .morton import root_cube
 from .parallel import Workers
@@ -40,6 +40,8 @@ from .writer import ColumnFolder, SceneWriter, partial_folder, writing
 
 _TOKEN = "token"
 _CELLS = "cells.npz"
+_FINISHED = "finished.npz"
+_POOL_CODES = "pool_codes"
 _PATIENCE_S = 10.0
 """How long a file that another host wrote may take to be seen."""
 
@@ -121,15 +123,26 @@ class _SharedBuild(Build):
             self.join_parts(runs)
         measured = np.array([runs.bytes, peak_resident_bytes()], np.float64)
         spilled, peaks = self.ranks.join(measured).reshape(-1, 2).T
-        report = None
+        finished = report = None
         with self.step():
-            if self.is_first:
-                assert self.scene is not None
-                self.workers = stack.enter_context(Workers(self.settings.threads))  # the other ranks only wait now
-                with self.timed("write"):
-                    self.assembly.append_top(self.array, self.workers)
+            if self.scene is not None:
+                with Workers(self.settings.threads) as all_workers:  # the other ranks only wait
+                    own_workers, self.workers = self.workers, all_workers
+                    with self.timed("write"):
+                        self.assembly.append_top(self.array, self.workers)
+                    with self.timed("finish"):
+                        finished = self.finish_cells(self.scene, origin, edge, tally)
+                    self.workers = own_workers
+                if self.settings.pools:
+                    self.save_finished(finished)
+        if self.settings.pools:
+            finished = self.pool_together(finished, origin, edge)
+        with self.step():
+            if self.scene is not None:
+                assert finished is not None
+                self.remove_what_is_no_scene()
                 with self.timed("finish"):
-                    info = self.finish(self.scene, origin, edge, tally)
+                    info = self.commit(self.scene, finished, tally)
                 report = self.report(info, int(spilled.sum()), int(peaks.max()), self.ranks.size)
         return report
 
@@ -257,10 +270,46 @@ class _SharedBuild(Build):
                     self.assembly.take(part, int(first_point[rank]))
                     parts.append({name: part[name] for name in POINT_ARRAY_PART})
                 self.array.go_on(parts)
-                self.remove_what_is_no_scene()
+
+    def save_finished(self, finished: Finished) -> None:
+        """Let the other ranks see the cells."""
+        blocks = {"block_first_point": finished.block_first_point, "block_origin": finished.block_origin}
+        arrays: dict[str, Any] = finished.cells | blocks | {"n_stored": np.array(self.array.n_stored)}
+        with writing(self.partial):
+            np.savez(self.partial / _FINISHED, **arrays)
+
+    def pool_together(self, finished: Finished | None, origin: np.ndarray, edge: float) -> Finished:
+        """Pool a share of the cells each; the finished cells with what all have added."""
+        cells: dict[str, np.ndarray] = {}
+        with self.step():
+            with np.load(self.partial / _FINISHED) as file:
+                arrays = dict(file)
+            n_stored = int(arrays.pop("n_stored"))
+            blocks = arrays.pop("block_first_point"), arrays.pop("block_origin")
+            finished = finished or Finished(arrays, origin, edge, *blocks)
+            columns = [self.writer.columns[axis].map_of(self.partial / f"{axis}.npy", n_stored) for axis in "xyz"]
+            cells = self.pool(finished, columns, (self.ranks.rank, self.ranks.size))
+            codes = self.writer.columns[_POOL_CODES]
+            if self.is_first:
+                codes.abandon()
+        assert finished is not None
+        for name, own in cells.items():
+            finished.cells[name] = self.ranks.total(own.astype(np.int64)).astype(own.dtype)
+        parts = self.ranks.join(np.array(codes.part, np.float64)).astype(np.int64).reshape(-1, 2)
+        with self.step():
+            if not self.is_first:
+                with writing(self.partial):
+                    codes.copy_into(self.partial / codes.path.name, int(parts[: self.ranks.rank, 0].sum()))
+        with self.step():
+            if self.is_first:
+                with writing(self.partial):
+                    codes.go_on([(rows, crc) for rows, crc in parts[1:].tolist()])
+        return finished
 
     def remove_what_is_no_scene(self) -> None:
+        """Leave the scene's own files in the folder."""
         with writing(self.partial):
             (self.partial / _TOKEN).unlink()
+            (self.partial / _FINISHED).unlink(missing_ok=True)
             for rank in range(1, self.ranks.size):
                 shutil.rmtree(self.rank_folder(rank))

@@ -65,7 +65,11 @@ class ColumnFile:
 
     def written(self) -> np.ndarray:
         """The rows so far: a read-only map."""
-        return np.memmap(self.path, self.dtype, "r", self._data_offset, (self._rows, *self._row_shape))
+        return self.map_of(self.path, self._rows)
+
+    def map_of(self, path: Path, rows: int) -> np.ndarray:
+        """So many rows of another such file, perhaps without its final header: a read-only map."""
+        return np.memmap(path, self.dtype, "r", self._data_offset, (rows, *self._row_shape))
 
     def rename(self, name: str) -> None:
         """Go on under another name."""
