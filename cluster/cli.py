@@ -33,6 +33,7 @@ app.add_typer(layer_app, name="layer")
 CellInputs = Annotated[
     list[str] | None, typer.Argument(help="Scenes, point files, folders or globs; default: a generated surface.")
 ]
+RanksOption = Annotated[int, typer.Option(help="Build on so many MPI ranks, started here; 0: without MPI.", min=0)]
 JsonOption = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write what was measured.")]
 
 
@@ -97,9 +98,12 @@ def build(
     n_pools: Annotated[int, typer.Option(help="Pools: most of a cell.")] = 2,
     strict: Annotated[bool, typer.Option(help="Refuse points that are not finite instead of dropping them.")] = False,
     overwrite: Annotated[bool, typer.Option(help="Replace an existing scene.")] = False,
+    ranks: RanksOption = 0,
     json: JsonOption = None,
 ) -> None:
     """Build a scene from point files, larger than memory if need be.
+
+    `mpirun -n N splatpipe build …` shares the work among ranks that see the same folders; so does `--ranks N`.
 
     Example: `splatpipe build 'survey/*.laz' -o survey.scene --memory 8GB`
     """
@@ -127,7 +131,7 @@ def build(
         strict=strict,
         overwrite=overwrite,
     )
-    build_command(inputs, output, settings, json)
+    raise typer.Exit(build_command(inputs, output, settings, json, ranks))
 
 
 @app.command()
@@ -139,6 +143,7 @@ def synth(
     features: Annotated[bool, typer.Option("--features", help="As for `splatpipe build`.")] = False,
     pools: Annotated[bool, typer.Option("--pools", help="As for `splatpipe build`.")] = False,
     overwrite: Annotated[bool, typer.Option(help="Replace an existing scene.")] = False,
+    ranks: RanksOption = 0,
 ) -> None:
     """Make a synthetic city scan: a scene directory, or a LAS/LAZ file.
 
@@ -148,7 +153,7 @@ def synth(
     from .scenes import synth_command
 
     settings = BuildSettings(overwrite=overwrite, up="z", splats=splats, features=features, pools=pools)
-    synth_command(output, points, seed, settings)
+    raise typer.Exit(synth_command(output, points, seed, settings, ranks))
 
 
 @app.command()
@@ -472,17 +477,18 @@ def bench_budget(
 def bench_build(
     points: Annotated[int, typer.Option(help="Number of points of the LAS file.", min=1000)] = 20_000_000,
     repeats: Annotated[int, typer.Option(help="Timed builds.", min=1)] = 3,
+    ranks: Annotated[int, typer.Option(help="Also on so many MPI ranks of this host; 0: not.", min=0)] = 0,
     workdir: Annotated[Path | None, typer.Option(help="Where the file and the scenes go.")] = None,
     json: JsonOption = None,
 ) -> None:
-    """LAS file → scene: points per second and peak memory, in memory and external.
+    """LAS file → scene: points per second and peak memory, in memory, external and on MPI ranks.
 
-    Example: `splatpipe bench build --points 20000000 --json build.json`
+    Example: `splatpipe bench build --points 20000000 --ranks 2 --json build.json`
     """
     from .bench.build import bench_build as measure
     from .bench.build import print_build
 
-    _report(measure(n_points=points, repeats=repeats, workdir=workdir), print_build, json)
+    _report(measure(n_points=points, repeats=repeats, ranks=ranks, workdir=workdir), print_build, json)
 
 
 @bench_app.command("pipeline")

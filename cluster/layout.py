@@ -67,7 +67,8 @@ class Layout:
 
         Of many render ranks that composite, only those with the display: which others talk is up to the policy.
         """
-        found = {(a, b) for lane in self.lanes for a in lane.culling for b in lane.sampling}
+        apart = [lane for lane in self.lanes if lane.culling != lane.sampling]  # else each has its own part's bits
+        found = {(a, b) for lane in apart for a in lane.culling for b in lane.sampling}
         found |= {(a, b) for lane in self.lanes for a in lane.sampling for b in lane.render}
         meeting = self.render if self.split == "shares" and len(self.render) <= FEW_RENDERS else (self.display,)
         found |= {(a, b) for a in meeting for b in self.render}

@@ -353,15 +353,16 @@ class FrameLoop:
             with self._clocks["culling"].working():
                 bits = self._culling.process(camera)
                 of_layers = [node.process(camera) for node in self._layer_culling]
-            for rank, message in zip(lane.sampling, bits, strict=True):
-                self._hand(rank, Kind.VISIBILITY, message)
+            for part, message in zip(self._culling.receivers, bits, strict=True):
+                self._hand(lane.sampling[part], Kind.VISIBILITY, message)
             for message in of_layers:
                 self._hand(first.sampling[0], Kind.VISIBILITY, message)
             self._counts.add(self._culling.whole)
         if self._sampling:
             with self._clocks["sampling"].waiting():
                 received = [
-                    self._take_bits(rank, n) for rank, n in zip(lane.culling, self._sampling.n_cells, strict=True)
+                    self._take_bits(lane.culling[part], n)
+                    for part, n in zip(self._sampling.senders, self._sampling.n_cells, strict=True)
                 ]
                 bits_of_layers = [
                     self._take_bits(first.culling[0], len(layer.octree))

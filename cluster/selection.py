@@ -107,6 +107,7 @@ def first_plan(job: Job, layout: Layout, lanes: Sequence[LaneCells]) -> Plan:
 class CullingPart:
     """A culling rank's part of a lane, under plans of the same borders of subtrees, without a window at first.
 
+    receivers : numbers of the sampling parts that have subtrees of this one.
     whole : bits of all its cells, of the frame processed last.
     """
 
@@ -114,17 +115,15 @@ class CullingPart:
         mine, octree, _ = cells.part(plan.culling[lane], i)
         self._node: CullingNode = job.culling_node(octree)
         self._window: Window | None = None
-        sampling = layout.lanes[lane].sampling
-        self._common: list[np.ndarray | None] = [
-            common_cells(mine, cells.cells_of(plan.sampling[lane], j)) for j in range(len(sampling))
-        ]
+        self.receivers = overlapping(plan.culling[lane], i, plan.sampling[lane])
+        self._common = [common_cells(mine, cells.cells_of(plan.sampling[lane], j)) for j in self.receivers]
 
     def look_through(self, layout: Layout, lane: int, plan: Plan) -> None:
         """Take the window of a plan that has the borders of this part."""
         self._window = lane_window(layout, lane, plan)
 
     def process(self, camera: Camera) -> list[VisibilityBits]:
-        """The bits of a frame, for each sampling part of the lane."""
+        """The bits of a frame, for each of the ``receivers``."""
         self.whole = bits = self._node.process(camera, self._window)
         if all(common is None for common in self._common):
             return [bits] * len(self._common)
@@ -137,7 +136,7 @@ class CullingPart:
 class SamplingPart:
     """A sampling rank's part of a lane, under plans of the same borders of subtrees, without windows at first.
 
-    n_cells : of the bits that come from each culling part.
+    senders : numbers of the culling parts that have subtrees of this one.  n_cells : of the bits that each sends.
     """
 
     def __init__(
@@ -152,8 +151,8 @@ class SamplingPart:
     ) -> None:
         mine, octree, own = cells.part(plan.sampling[lane], i)
         self._node: SamplingNode = job.sampling_node(octree, own)
-        culling = layout.lanes[lane].culling
-        self._common = [common_cells(mine, cells.cells_of(plan.culling[lane], j)) for j in range(len(culling))]
+        self.senders = overlapping(plan.sampling[lane], i, plan.culling[lane])
+        self._common = [common_cells(mine, cells.cells_of(plan.culling[lane], j)) for j in self.senders]
         self._n = len(octree)
         self.n_cells = [self._n if common is None else len(common) for common in self._common]
         renders = layout.renders_of(lane)
@@ -184,6 +183,14 @@ class SamplingPart:
         for bits, common in zip(received, self._common, strict=True):
             visible[slice(None) if common is None else common] |= bits.unpack()
         return VisibilityBits.pack(frame, visible)
+
+
+def overlapping(mine: Sequence[int], i: int, theirs: Sequence[int]) -> list[int]:
+    """Numbers of the parts of other borders that have a subtree of the i-th part; of what is not dealt, the whole."""
+    n = len(theirs) - 1
+    if len(mine) == 2 or n == 1:
+        return list(range(n))
+    return [j for j in range(n) if max(mine[i], theirs[j]) < min(mine[i + 1], theirs[j + 1])]
 
 
 def common_cells(mine: np.ndarray, theirs: np.ndarray) -> np.ndarray | None:

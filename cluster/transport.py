@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import threading
 import time
 import warnings
 from collections import defaultdict, deque
@@ -71,6 +72,7 @@ class Transport:
         self._comm: Any = MPI.COMM_WORLD.Dup()
         self.rank: int = self._comm.Get_rank()
         self.size: int = self._comm.Get_size()
+        self._any_thread = MPI.Query_thread() >= MPI.THREAD_SERIALIZED
         self.timeout_s = timeout_s
         self.patience_s = 3600.0
         self._depth = depth
@@ -171,6 +173,10 @@ class Transport:
         """Whether a message of a kind waits to be received. Cost: one probe."""
         return bool(self._comm.Iprobe(source, int(kind)))
 
+    def may_talk(self) -> bool:
+        """Whether the thread that asks may send and receive: any, one at a time, where MPI allows it."""
+        return self._any_thread or threading.current_thread() is threading.main_thread()
+
     def agree(self, status: int) -> list[int]:
         """The status, or another small number, of every rank. Collective."""
         statuses = np.empty(self.size, np.int32)
@@ -183,6 +189,20 @@ class Transport:
         joined = np.empty(sum(counts))
         self._poll([self._comm.Iallgatherv(np.ascontiguousarray(values, np.float64), [joined, counts])])
         return joined
+
+    def total(self, counts: np.ndarray) -> np.ndarray:
+        """Int64 sums over all ranks of an array that has the same shape on each. Collective."""
+        sums = np.empty_like(counts)
+        self._poll([self._comm.Iallreduce(np.ascontiguousarray(counts), sums)])
+        return sums
+
+    def gather(self, data: bytes) -> list[bytes]:
+        """The bytes that each rank gives, below 2 GiB together. Collective."""
+        lengths = self.agree(len(data))
+        joined = bytearray(sum(lengths))
+        self._poll([self._comm.Iallgatherv([data, self._mpi.BYTE], [joined, lengths, None, self._mpi.BYTE])])
+        ends = np.cumsum(lengths).tolist()
+        return [bytes(joined[end - n : end]) for end, n in zip(ends, lengths, strict=True)]
 
     def minimum_of(self, ranks: Sequence[int]) -> Callable[[np.ndarray], np.ndarray | None]:
         """What takes (n,) uint64 of each of these ranks to their minimum on the first of them, None elsewhere.
@@ -230,6 +250,13 @@ class Transport:
         if not serve:
             self._comm.Send(buffer, peer)
 
+    def idle(self, dest: int) -> bool:
+        """Whether all that was sent to a rank has gone."""
+        queue = self._under_way[dest]
+        while queue and self._mpi.Request.Testall(queue[0][0]):
+            queue.popleft()
+        return not queue
+
     def traffic(self) -> dict[str, dict[str, int]]:
         """Messages and bytes (headers included) this rank has sent, by kind."""
         return {kind: {"count": self._count[kind], "bytes": n} for kind, n in self._bytes.items()}
@@ -239,9 +266,18 @@ class Transport:
         self._bytes.clear()
         self._count.clear()
 
-    def meet(self) -> None:
-        """Wait until every rank is here, for up to ``patience_s``: loading a scene takes its time. Collective."""
-        self._poll([self._comm.Ibarrier()])
+    def meet(self, meanwhile: Callable[[], None] | None = None) -> None:
+        """Wait until every rank is here, for up to ``patience_s``: loading a scene takes its time. Collective.
+
+        meanwhile : called time and again while this rank waits, which then has no limit.
+        """
+        request = self._comm.Ibarrier()
+        if meanwhile is None:
+            self._poll([request])
+            return
+        while not request.Test():
+            meanwhile()
+            time.sleep(_SLEEP_S[1])
 
     def finish(self) -> None:
         """Wait until everything sent has gone and every rank is here. Collective."""
@@ -272,9 +308,8 @@ class Transport:
         return [body[i : i + self._piece_bytes] for i in range(0, len(body), self._piece_bytes)]
 
     def _drain(self, dest: int, at_most: int) -> None:
+        self.idle(dest)  # takes out what has gone
         queue = self._under_way[dest]
-        while queue and self._mpi.Request.Testall(queue[0][0]):
-            queue.popleft()
         while len(queue) > at_most:
             self._wait(queue[0][0], dest, "a message sent to it to be taken", self.timeout_s)
             queue.popleft()

@@ -14,6 +14,7 @@ message            from → to                     payload
 ``SceneBytes``     sampling → render             the bytes asked for, as they are stored
 ``Framebuffer``    render → render               words of pixels, by runs (``framebuffer_runs``); none: background
 ``FilmPicture``    render → rank 0               8-bit red, green, blue of each pixel
+``Build``          any → any                     JSON: how far a rank is with its part of a build, or that it failed
 =================  ============================  ============================================================
 
 Those of scenes cross before the first frame, where ``scene.delivery`` is ``messages``. Their header has the number of
@@ -79,6 +80,7 @@ class Kind(IntEnum):
     PLAN = 10
     FILM_PICTURE = 11
     STAGE_TIMES = 12
+    BUILD = 32
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from splatpipe.cluster.compression import FASTEST_BYTES_PER_S, Choice, Coding, L
 from splatpipe.cluster.launch import find_mpiexec, mpi_available
 from splatpipe.cluster.plan.command import plan_command
 from splatpipe.shared.build import BuildSettings, build_scene
+from splatpipe.shared.config import PipelineSection
 from splatpipe.shared.message_codecs import unpack
 from splatpipe.shared.messages import (
     RENDER_POINT,

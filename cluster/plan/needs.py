@@ -131,7 +131,7 @@ def _compression(job: Job, work: Workload, decision: Decision) -> Part:
     spent_ms = 1e3 * COSTS.code_byte_s * raw
     if decision.topology == "single" or not kinds:
         why = "one rank: nothing is sent" if decision.topology == "single" else "no message of it has a coded form"
-        return Part(COMPRESSION, True, why, spent_ms, "ms/frame")
+        return Part(COMPRESSION, True, why, None, "ms/frame")
     why = f"pipeline.compression is {pipeline.compression}: {kinds}, about {raw:,.0f} → {coded:,.0f} bytes a frame"
     if pipeline.link_mb_per_s:
         saved_ms = 1e-3 * (raw - coded) / pipeline.link_mb_per_s
