@@ -98,6 +98,7 @@ class Job:
             self.colouring = Colouring.choose(self.scene, SPLAT_COLOUR)
         self.views = camera_views(config.camera, info, self.n_pictures, render.supersampling)
         self.n_frames = self.n_pictures * self.views.per_picture
+        self.frames: Sequence[int] = range(self.n_frames)  # to be drawn: all views of some pictures
         largest_px = render.supersampling * max(config.camera.width, config.camera.height)
         if largest_px > MAX_SIDE_PX:
             raise ConfigError(
@@ -149,11 +150,15 @@ class Job:
 
     def culling_node(self, octree: Octree) -> CullingNode:
         """The culling node of this run."""
-        margin_px = self.largest_point_px / 2 + 0.5  # a point just outside reaches in; and rounding moves it
-        return CullingNode(octree, backface=self.backface, margin_px=margin_px, point_filter=self.point_filter)
+        return CullingNode(octree, backface=self.backface, margin_px=self._margin_px, point_filter=self.point_filter)
 
-    def sampling_node(self, octree: Octree) -> SamplingNode:
-        """The sampling node of this run.
+    @property
+    def _margin_px(self) -> float:
+        """A point so far outside reaches in; and rounding moves it."""
+        return self.largest_point_px / 2 + 0.5
+
+    def sampling_node(self, octree: Octree, own: np.ndarray | None = None) -> SamplingNode:
+        """The sampling node of this run, or of a part of its octree that answers for the cells ``own``.
 
         Its threshold is in pixels of the picture; how many points cover a cell is counted in drawn pixels, so that each
         of those that are averaged has points of its own.
@@ -166,6 +171,8 @@ class Job:
             whole_sets=self.coded,
             pools=self.pools,
             point_bytes=self.position_bytes + self.attribute_bytes,
+            own=own,
+            margin_px=self._margin_px,
         )
 
     def _read_layers(self) -> list[Layer]:
@@ -233,7 +240,8 @@ class Job:
     ) -> Iterator[RenderStage]:
         """The render node of this run with its points loaded, its kernels compiled and its output open.
 
-        scene : a share of the run's, whose points are drawn.  shown : whether pictures are made of what is drawn.
+        scene : a share of the run's, whose points are drawn.  shown : whether pictures are made of what is drawn, and
+        layers drawn over it.
         """
         progress("loading points", 0)
         points = self.load_drawn(scene, verify=self.config.scene.verify)
@@ -246,7 +254,7 @@ class Job:
                 progress("compiling kernels (once; kept for the next run)", 0)
             node.warm_up(self.camera(0))
             layers = None
-            if self.layers:
+            if self.layers and shown:
                 progress("loading layers", 0)
                 layers = stack.enter_context(self._open_layers())
                 layers.warm_up(self.camera(0))
@@ -334,19 +342,16 @@ class RenderStage:
         self._per_picture = per_picture
         self.description = " + ".join(part.description for part in (node, layers) if part)
 
-    def draw(self, camera: Camera, chosen: RenderPoints, of_layers: Sequence[RenderPoints] = ()) -> Picture | None:
-        """Draw a frame; the picture that it completes, None before its last view or where nobody wants it."""
-        return self.compose(camera, self.rasterize(camera, chosen, of_layers))
+    def rasterize(self, camera: Camera, chosen: RenderPoints) -> np.ndarray:
+        """(height, width) uint64 framebuffer words of a frame's points; valid until the next call."""
+        return self._node.process(camera, chosen)
 
-    def rasterize(self, camera: Camera, chosen: RenderPoints, of_layers: Sequence[RenderPoints] = ()) -> np.ndarray:
-        """(height, width) uint64 framebuffer words of a frame; valid until the next call."""
-        words = self._node.process(camera, chosen)
+    def compose(self, camera: Camera, words: np.ndarray, of_layers: Sequence[RenderPoints] = ()) -> Picture | None:
+        """The picture that a frame completes, its layers drawn over the words of its points; None before its last view
+        or where nobody wants it.
+        """
         if self._layers is not None:
             words = self._layers.process(camera, of_layers, words)
-        return words
-
-    def compose(self, camera: Camera, words: np.ndarray) -> Picture | None:
-        """The picture that the words of a frame complete, as of ``draw``."""
         if self._composer is None:
             return None
         return self._composer.add(camera.frame % self._per_picture, camera, words)

@@ -1,34 +1,50 @@
-"""The frame loop: culling → sampling → render, on one rank or on three.
+"""The frame loop: culling → sampling → render → display, on the ranks of a layout.
 
-On three ranks frame *i* is drawn while *i + 1* is sampled and *i + 2* culled (thesis 5.2). The coordinator, which is
-also the culling rank, starts a frame only while fewer than ``frames_in_flight`` are unfinished, so nothing piles up.
-Each rank opens only its half of the scene: the selection ranks never load a point, the render rank no octree. Where
-the scene is delivered by messages, the sampling rank reads the render rank's half for it and sends it (``delivery``).
+Every rank goes through the frames in order and does its stages of each; what a stage makes for another rank is sent,
+what it makes for this one is handed on. On three ranks frame *i* is drawn while *i + 1* is sampled and *i + 2* culled
+(thesis 5.2). The coordinator, rank 0, starts a frame only while fewer than ``frames_in_flight`` are unfinished, so
+nothing piles up. Each rank opens only its half of the scene: the selection ranks never load a point, the render rank
+no octree unless it has a share of the points. Where the scene is delivered by messages, the sampling rank reads the
+render rank's half for it and sends it (``delivery``).
 """
 
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
+from ..shared.camera import Camera
 from ..shared.config import RunConfig
 from ..shared.messages import (
+    FRAME_START_BYTES,
     RENDER_POINT,
+    FrameStart,
     Kind,
-    decode_camera,
+    Message,
+    RenderPoints,
+    VisibilityBits,
+    decode_frame_start,
     decode_render_points,
     decode_visibility,
 )
+from ..shared.scene_share import SceneShare
+from .compositing import Assembler, make_assembler
 from .delivery import receive_scene, serve_scene
-from .job import Job
+from .job import Job, RenderStage
+from .layout import ALONE, Layout, Plan
 from .record import FrameCounts, StageClock, rank_record, spread_ms
-from .topologies import PIPELINE_ROLES as ROLES
+from .selection import CullingPart, LaneCells, SamplingPart, first_plan, merged_entries, shares_of
 from .transport import Transport
 
+STAGES = ("culling", "sampling", "render", "compositing", "picture")
 CULLING, SAMPLING, RENDER = range(3)
-_MAX_CAMERA_BYTES = 1 << 10
+"""Ranks of a chain of three, where a scene is delivered by messages."""
 
 Progress = Callable[[str, int], None]
 """Called with what is going on and how many frames are done."""
@@ -36,9 +52,10 @@ Progress = Callable[[str, int], None]
 
 @dataclass(frozen=True)
 class Drawn:
-    """What a rank that does everything itself has to say of its frames.
+    """What a rank has to say of its frames.
 
-    clocks : of culling, sampling and render.  times : of encoding, by kind of output.
+    clocks : of its stages.  times : of encoding, by kind of output.  held : what its record says beside the rest.
+    latency_s : on the coordinator, of each frame.
     started, drawn : when the first frame began and the last one was drawn (``time.perf_counter``).
     """
 
@@ -46,6 +63,8 @@ class Drawn:
     counts: FrameCounts
     times: dict[str, list[float]]
     rasterizer: str
+    held: dict[str, Any]
+    latency_s: list[float]
     loading_s: float
     started: float
     drawn: float
@@ -55,7 +74,7 @@ class Drawn:
         return {
             "rasterizer": self.rasterizer,
             "stages": {clock.stage: clock.summary() for clock in self.clocks},
-            "latency_ms": spread_ms([sum(t) for t in zip(*(clock.work_s for clock in self.clocks), strict=True)]),
+            "latency_ms": spread_ms(self.latency_s),
             "per_frame": {f"{clock.stage}_s": clock.work_s for clock in self.clocks} | self.counts.lists() | self.times,
             "loading_s": self.loading_s,
             "rendered_s": self.drawn - self.started,
@@ -64,114 +83,23 @@ class Drawn:
 
 
 def run_single(job: Job, progress: Progress) -> dict[str, Any]:
-    """All three nodes in this process, frame after frame; the statistics of the run. Imports no MPI."""
-    drawn = draw_alone(job, range(job.n_frames), progress, lambda: None)
+    """All stages in this process, frame after frame; the statistics of the run. Imports no MPI."""
+    drawn = FrameLoop(job, ALONE, None, progress).run()
     return drawn.record() | {"ranks": [rank_record("single", 0)], "messages": {}}
 
 
-def draw_alone(job: Job, frames: Sequence[int], progress: Progress, ready: Callable[[], None]) -> Drawn:
-    """Draw frames, views of whole pictures, with all three nodes in this process, and write the pictures.
-
-    ready : called when all is loaded, before the first frame.
-    """
-    loading = time.perf_counter()
-    clocks = [StageClock(role) for role in ROLES]
-    counts = FrameCounts()
-    octree = job.load_octree()
-    culling, sampling = job.culling_node(octree), job.sampling_node(octree)
-    layers = job.layer_nodes()
-    sampling.process(job.camera(0), culling.process(job.camera(0)))  # compiles, or loads what was compiled
-    with job.open_render(progress) as render:
-        ready()
-        started = time.perf_counter()
-        loading_s = started - loading
-        for done, frame in enumerate(frames, 1):
-            camera = job.camera(frame)
-            with clocks[CULLING].working():
-                bits = culling.process(camera)
-                bits_of_layers = [layer_culling.process(camera) for layer_culling, _ in layers]
-            with clocks[SAMPLING].working():
-                chosen = sampling.process(camera, bits)
-                of_layers = [node.process(camera, seen) for (_, node), seen in zip(layers, bits_of_layers, strict=True)]
-            with clocks[RENDER].working():
-                picture = render.draw(camera, chosen, of_layers)
-            with clocks[RENDER].waiting():
-                render.show(frame, picture)
-            counts.add(bits, chosen)
-            counts.add_layers(of_layers)
-            progress("rendering", done)
-        drawn = time.perf_counter()
-    return Drawn(clocks, counts, render.times(), render.description, loading_s, started, drawn)
-
-
-def run_pipelined(job: Job, transport: Transport, progress: Progress) -> dict[str, Any] | None:
-    """Do this rank's part of the pipeline; the statistics of the run on rank 0, None elsewhere.
-
-    Ranks beyond the third have no part in this topology and only wait for the end. Collective.
-    """
-    match transport.rank:
-        case 0:
-            result = _coordinate(job, transport, progress)
-        case 1:
-            result = _sample(job, transport)
-        case 2:
-            result = _render(job, transport)
-        case _:
-            transport.meet()
-            result = None
+def run_layout(job: Job, layout: Layout, transport: Transport, progress: Progress) -> dict[str, Any] | None:
+    """Do this rank's part of a layout; the statistics of the run on rank 0, None elsewhere. Collective."""
+    drawn = FrameLoop(job, layout, transport, progress).run()
+    told = _told(layout, drawn, transport)
+    result = None
+    if transport.rank == 0:
+        others = [rank for rank in layout.workers if rank]
+        result = _merged(drawn, [told, *(transport.receive_note(rank, Kind.STATISTICS)[1] for rank in others)])
+    elif transport.rank in layout.workers:
+        transport.send_note(0, Kind.STATISTICS, len(job.frames), told)
     transport.finish()
     return result
-
-
-def _coordinate(job: Job, transport: Transport, progress: Progress) -> dict[str, Any]:
-    loading = time.perf_counter()
-    clock = StageClock("culling")
-    culling = job.culling_node(job.scene.octree())
-    culling.process(job.camera(0))
-    layers = [layer_culling for layer_culling, _ in job.layer_nodes()]
-    progress("loading the scene", 0)
-    transport.meet()
-    counts = FrameCounts()
-    issued_s: list[float] = []
-    latency_s: list[float] = []
-
-    def frame_done() -> None:
-        frame, _ = transport.receive_note(RENDER, Kind.FRAME_DONE)
-        latency_s.append(time.perf_counter() - issued_s[frame])
-        progress("rendering", frame + 1)
-
-    started = time.perf_counter()
-    loading_s = started - loading
-    for frame in range(job.n_frames):
-        with clock.waiting():
-            while frame - len(latency_s) >= job.frames_in_flight or transport.has_note(RENDER, Kind.FRAME_DONE):
-                frame_done()
-        camera = job.camera(frame)
-        issued_s.append(time.perf_counter())
-        for rank in (SAMPLING, RENDER):
-            transport.send(rank, camera)
-        with clock.working():
-            bits = culling.process(camera)
-            bits_of_layers = [layer_culling.process(camera) for layer_culling in layers]
-        for message in (bits, *bits_of_layers):
-            transport.send(SAMPLING, message)
-        counts.add(bits)
-    while len(latency_s) < job.n_frames:
-        frame_done()
-    rendered_s = time.perf_counter() - started
-    of_sampling, of_render = (transport.receive_note(rank, Kind.STATISTICS)[1] for rank in (SAMPLING, RENDER))
-    ranks = [_statistics(transport, clock, counts), of_sampling, of_render]
-    return {
-        "rasterizer": of_render["rasterizer"],
-        "ranks": [rank["rank"] for rank in ranks],
-        "stages": {rank["stage"]: rank["summary"] for rank in ranks},
-        "messages": {kind: count for rank in ranks for kind, count in rank["messages"].items()},
-        "latency_ms": spread_ms(latency_s),
-        "per_frame": {name: values for rank in ranks for name, values in rank["per_frame"].items()},
-        "loading_s": loading_s,
-        "rendered_s": rendered_s,
-        "finished_s": time.perf_counter() - started,
-    }
 
 
 def receive_job(config: RunConfig, transport: Transport) -> Job:
@@ -181,63 +109,319 @@ def receive_job(config: RunConfig, transport: Transport) -> Job:
     return Job(config.model_copy(update=settled), scene)
 
 
-def _sample(job: Job, transport: Transport) -> None:
-    clock = StageClock("sampling")
-    if job.config.scene.delivery == "messages":
-        serve_scene(job.scene, job.colour, transport, RENDER)
-    octree = job.load_octree()
-    sampling = job.sampling_node(octree)
-    sampling.process(job.camera(0), job.culling_node(octree).process(job.camera(0)))
-    transport.meet()
-    layers = [node for _, node in job.layer_nodes()]
-    n_cells = [len(octree), *(len(layer.octree) for layer in job.layers)]
-    for _ in range(job.n_frames):
-        with clock.waiting():
-            camera = decode_camera(*transport.receive(CULLING, Kind.CAMERA, _MAX_CAMERA_BYTES))
-            bits, *bits_of_layers = [
-                decode_visibility(*transport.receive(CULLING, Kind.VISIBILITY, (n + 7) // 8), n) for n in n_cells
-            ]
-        with clock.working():
-            chosen = [sampling.process(camera, bits)]
-            chosen += [node.process(camera, seen) for node, seen in zip(layers, bits_of_layers, strict=True)]
-        for message in chosen:
-            transport.send(RENDER, message)
-    transport.send_note(CULLING, Kind.STATISTICS, job.n_frames, _statistics(transport, clock, FrameCounts()))
+class FrameLoop:
+    """One rank's way through the frames of a job.
 
+    transport : None where there is one rank.  ready : called when all is loaded, before the first frame; by default
+    the ranks meet.
+    """
 
-def _render(job: Job, transport: Transport) -> None:
-    clock = StageClock("render")
-    counts = FrameCounts()
-    info = job.scene.info
-    most_entries = [info.n_cells + info.n_stored // 2**31 + 1]  # a longer range is split
-    most_entries += [len(layer.octree) for layer in job.layers]
-    with job.open_render(lambda *_: None) as render:
-        transport.meet()
-        for frame in range(job.n_frames):
-            with clock.waiting():
-                camera = decode_camera(*transport.receive(CULLING, Kind.CAMERA, _MAX_CAMERA_BYTES))
-                chosen, *of_layers = [
-                    decode_render_points(*transport.receive(SAMPLING, Kind.RENDER_POINTS, n * RENDER_POINT.itemsize))
-                    for n in most_entries
+    def __init__(
+        self,
+        job: Job,
+        layout: Layout,
+        transport: Transport | None,
+        progress: Progress,
+        ready: Callable[[], object] | None = None,
+    ) -> None:
+        self._job, self._layout, self._transport, self._progress = job, layout, transport, progress
+        self._rank = transport.rank if transport else 0
+        self._ready = ready or (transport.meet if transport else lambda: None)
+        self._lane = layout.lane_of(self._rank)
+        stages = layout.lanes[self._lane].stages_of(self._rank) if self._lane is not None else []
+        self._culls, self._samples, self._renders = (stage in stages for stage in STAGES[:3])
+        self._shows = self._rank == layout.display
+        self._clocks = {name: StageClock(name) for name in STAGES}
+        self._waits_in = self._clocks[stages[0] if stages else "culling"]
+        self._counts = FrameCounts()
+        self._handed: dict[tuple[Kind, int], deque[Any]] = {}  # from a stage of this rank to the next
+        self._held: dict[str, Any] = {}
+
+    def run(self) -> Drawn:
+        """Load what this rank's stages need, and do its part of every frame of the job."""
+        loading = time.perf_counter()
+        job = self._job
+        with ExitStack() as stack:
+            self._open_selection()
+            render = self._open_render(stack)
+            self._warm_up_selection()
+            self._progress("loading the scene", 0)
+            self._ready()
+            started = time.perf_counter()
+            frames = Coordinator(job, self._layout, self._transport, self._plan) if self._rank == 0 else None
+            for i in range(len(job.frames) if self._lane is not None else 0):
+                with self._waits_in.waiting():
+                    start = frames.start(i, self._progress) if frames else self._receive_start()
+                self._select(start.camera)
+                if self._renders and render:
+                    self._draw(render, start.camera)
+                if self._shows and frames:
+                    frames.finished()
+                    self._progress("rendering", i + 1)
+                elif self._shows and self._transport:
+                    self._transport.send_note(0, Kind.FRAME_DONE, start.frame)
+            if frames:
+                frames.finish(self._progress)
+            drawn = time.perf_counter()
+        return Drawn(
+            [clock for clock in self._clocks.values() if clock.work_s],
+            self._counts,
+            render.times() if render else {},
+            render.description if render else "",
+            self._held,
+            frames.latency_s if frames else [],
+            started - loading,
+            started,
+            drawn,
+        )
+
+    # --- before the first frame --------------------------------------------------------------------------------------
+
+    def _open_selection(self) -> None:
+        """The octree and this rank's parts of it, if it selects or has a share of the points."""
+        job, layout = self._job, self._layout
+        if self._samples and self._transport and not self._shows and job.config.scene.delivery == "messages":
+            serve_scene(job.scene, job.colour, self._transport, layout.display)
+        self._shares: list[tuple[int, int]] = []
+        self._lanes: list[LaneCells] = []
+        selects = self._culls or self._samples
+        if selects or (self._renders and layout.split == "shares"):
+            whole = job.load_octree()
+            self._shares = shares_of(layout, whole)
+            if selects:
+                own = self._shares and len(self._shares) == len(layout.lanes) > 1
+                self._lanes = [
+                    LaneCells(lane, whole, self._shares[i] if own else None) for i, lane in enumerate(layout.lanes)
                 ]
-            with clock.working():
-                picture = render.draw(camera, chosen, of_layers)
-            with clock.waiting():
-                render.show(frame, picture)
-            counts.add(chosen)
-            counts.add_layers(of_layers)
-            transport.send_note(CULLING, Kind.FRAME_DONE, frame)
-    statistics = _statistics(transport, clock, counts)
-    statistics["per_frame"] |= render.times()
-    statistics["rasterizer"] = render.description
-    transport.send_note(CULLING, Kind.STATISTICS, job.n_frames, statistics)
+        self._adopt(first_plan(job, layout, self._lanes))
+        first = layout.lanes[0]
+        culls, samples = self._rank == first.culling[0], self._rank == first.sampling[0]
+        layers = job.layer_nodes() if culls or samples else []
+        self._layer_culling = [node for node, _ in layers] if culls else []
+        self._layer_sampling = [node for _, node in layers] if samples else []
+
+    def _adopt(self, plan: Plan) -> None:
+        """Make this rank's parts what a plan says."""
+        self._plan, lane = plan, self._lane
+        self._culling = self._sampling = None
+        if lane is None or not (self._culls or self._samples):
+            return
+        ranks, cells = self._layout.lanes[lane], self._lanes[lane]
+        if self._culls:
+            part = ranks.culling.index(self._rank)
+            self._culling = CullingPart(self._job, self._layout, lane, cells, plan, part)
+        if self._samples:
+            part = ranks.sampling.index(self._rank)
+            self._sampling = SamplingPart(self._job, self._layout, lane, cells, plan, part, self._shares)
+
+    def _open_render(self, stack: ExitStack) -> RenderStage | None:
+        """The render stage of this rank, on its share of the points; None for a rank that draws nothing."""
+        job, number = self._job, self._layout.render.index(self._rank) if self._renders else 0
+        share, sample = None, np.empty(0)
+        transport = self._transport if self._layout.split == "shares" else None
+        if transport and self._renders:
+            first, stop = self._shares[number]
+            share = SceneShare(job.scene, first, stop, checked_by=(number, len(self._shares)))
+            self._held = {"first_point": first, "points": stop - first}
+            if job.colouring.range_is_open:
+                sample = job.colouring.range_sample(share, first, job.scene.info.n_stored)
+        if transport and job.colouring.range_is_open:  # the ends of a colour map are those of all points
+            job.colouring = job.colouring.with_range_of(transport.join(sample))
+        if not self._renders:
+            return None
+        self._assembler: Assembler | None = None
+        if self._transport and len(self._layout.render) > 1:
+            self._assembler = make_assembler(job.config.pipeline, self._layout, self._transport)
+        return stack.enter_context(job.open_render(self._progress, share, shown=self._shows))
+
+    def _warm_up_selection(self) -> None:
+        """Compile what selecting needs, or load what was compiled."""
+        camera = self._job.camera(self._job.frames[0]) if len(self._job.frames) else self._job.camera(0)
+        if self._culling:
+            self._culling.process(camera)
+        if self._sampling:
+            self._sampling.process(
+                camera, [VisibilityBits.pack(camera.frame, np.zeros(n, bool)) for n in self._sampling.n_cells]
+            )
+
+    # --- a frame -----------------------------------------------------------------------------------------------------
+
+    def _receive_start(self) -> FrameStart:
+        assert self._transport
+        start = decode_frame_start(*self._transport.receive(0, Kind.FRAME_START, FRAME_START_BYTES))
+        while self._plan.number < start.plan:
+            self._adopt(Plan.from_note(self._transport.receive_note(0, Kind.PLAN)[1]))
+        return start
+
+    def _select(self, camera: Camera) -> None:
+        """Do this rank's part of culling and sampling, and hand it to whoever samples and renders it."""
+        if self._lane is None:
+            return
+        lane, first = self._layout.lanes[self._lane], self._layout.lanes[0]
+        if self._culling:
+            with self._clocks["culling"].working():
+                bits = self._culling.process(camera)
+                of_layers = [node.process(camera) for node in self._layer_culling]
+            for rank, message in zip(lane.sampling, bits, strict=True):
+                self._hand(rank, Kind.VISIBILITY, message)
+            for message in of_layers:
+                self._hand(first.sampling[0], Kind.VISIBILITY, message)
+            self._counts.add(self._culling.whole)
+        if self._sampling:
+            with self._clocks["sampling"].waiting():
+                received = [
+                    self._take_bits(rank, n) for rank, n in zip(lane.culling, self._sampling.n_cells, strict=True)
+                ]
+                bits_of_layers = [
+                    self._take_bits(first.culling[0], len(layer.octree))
+                    for layer in self._job.layers[: len(self._layer_sampling)]
+                ]
+            with self._clocks["sampling"].working():
+                chosen, by_render = self._sampling.process(camera, received)
+                of_layers = [
+                    node.process(camera, seen) for node, seen in zip(self._layer_sampling, bits_of_layers, strict=True)
+                ]
+            for rank, message in zip(lane.render, by_render, strict=True):
+                self._hand(rank, Kind.RENDER_POINTS, message)
+            for message in of_layers:
+                self._hand(self._layout.display, Kind.RENDER_POINTS, message)
+            self._counts.add(chosen)
+
+    def _draw(self, render: RenderStage, camera: Camera) -> None:
+        """Rasterize this rank's part, and on the display rank make the picture of all parts."""
+        layout, clock = self._layout, self._clocks["render"]
+        lane = layout.lanes[self._lane or 0]
+        info = self._job.scene.info
+        most = info.n_cells + info.n_stored // 2**31 + 1  # a longer range is split
+        with clock.waiting():
+            received = [self._take_entries(rank, most) for rank in lane.sampling]
+            layers = self._job.layers if self._shows else []
+            of_layers = [self._take_entries(layout.lanes[0].sampling[0], len(layer.octree)) for layer in layers]
+        with clock.working():
+            words = render.rasterize(camera, merged_entries(camera.frame, received))
+            picture = render.compose(camera, words, of_layers) if not self._assembler and self._shows else None
+        if self._assembler:
+            with self._clocks["compositing"].working():
+                whole = self._assembler.assemble(camera.frame, words, self._plan.windows)
+            if whole is not None:
+                with self._clocks["picture"].working():
+                    picture = render.compose(camera, whole, of_layers)
+        with clock.waiting():
+            render.show(camera.frame, picture)
+        self._counts.add_layers(of_layers)
+
+    # --- between stages ----------------------------------------------------------------------------------------------
+
+    def _hand(self, rank: int, kind: Kind, message: Message) -> None:
+        if rank == self._rank:
+            self._handed.setdefault((kind, rank), deque()).append(message)
+        elif self._transport:
+            self._transport.send(rank, message)
+
+    def _take_bits(self, rank: int, n_cells: int) -> VisibilityBits:
+        if rank == self._rank:
+            return self._handed[Kind.VISIBILITY, rank].popleft()
+        assert self._transport
+        return decode_visibility(*self._transport.receive(rank, Kind.VISIBILITY, (n_cells + 7) // 8), n_cells)
+
+    def _take_entries(self, rank: int, most: int) -> RenderPoints:
+        if rank == self._rank:
+            return self._handed[Kind.RENDER_POINTS, rank].popleft()
+        assert self._transport
+        limit = most * RENDER_POINT.itemsize
+        return decode_render_points(*self._transport.receive(rank, Kind.RENDER_POINTS, limit))
 
 
-def _statistics(transport: Transport, clock: StageClock, counts: FrameCounts) -> dict[str, Any]:
+class Coordinator:
+    """Starts frames on the other ranks, few enough at a time, and hears when they are done. On rank 0."""
+
+    def __init__(self, job: Job, layout: Layout, transport: Transport | None, plan: Plan) -> None:
+        self._job, self._transport, self._plan = job, transport, plan
+        self._others = [rank for rank in layout.workers if rank]
+        self._display = layout.display
+        self._ahead = job.frames_in_flight if self._others else 1
+        self._starts: list[FrameStart] = []
+        self._issued_s: list[float] = []
+        self.latency_s: list[float] = []
+
+    def start(self, i: int, progress: Progress) -> FrameStart:
+        """Frame ``i`` as this rank is to do it, once it may start; as many others as may start have been started."""
+        self._issue()
+        while len(self._starts) <= i or self._has_done():
+            self._hear(progress)
+            self._issue()
+        return self._starts[i]
+
+    def finished(self) -> None:
+        """Take note that the display has finished the next frame."""
+        self.latency_s.append(time.perf_counter() - self._issued_s[len(self.latency_s)])
+
+    def finish(self, progress: Progress) -> None:
+        """Hear of every frame that is still to be finished."""
+        while len(self.latency_s) < len(self._job.frames):
+            self._hear(progress)
+
+    def _issue(self) -> None:
+        frames = self._job.frames
+        while len(self._starts) < min(len(frames), len(self.latency_s) + self._ahead):
+            start = FrameStart(self._job.camera(frames[len(self._starts)]), self._plan.number)
+            for rank in self._others:
+                assert self._transport
+                self._transport.send(rank, start)
+            self._starts.append(start)
+            self._issued_s.append(time.perf_counter())
+
+    def _has_done(self) -> bool:
+        return bool(self._display and self._transport and self._transport.has_note(self._display, Kind.FRAME_DONE))
+
+    def _hear(self, progress: Progress) -> None:
+        assert self._transport
+        self._transport.receive_note(self._display, Kind.FRAME_DONE)
+        self.finished()
+        progress("rendering", len(self.latency_s))
+
+
+def _told(layout: Layout, drawn: Drawn, transport: Transport) -> dict[str, Any]:
+    """What rank 0 is told of a rank, JSON-able."""
+    record = rank_record(layout.role_of(transport.rank), transport.rank) | drawn.held
+    record |= {"stages": {clock.stage: clock.summary() for clock in drawn.clocks}, "loading_s": drawn.loading_s}
     return {
-        "stage": clock.stage,
-        "summary": clock.summary(),
-        "rank": rank_record(clock.stage, transport.rank),
+        "rank": record,
+        "work_s": {clock.stage: clock.work_s for clock in drawn.clocks},
+        "wait_s": {clock.stage: sum(clock.wait_s) for clock in drawn.clocks},
+        "counts": drawn.counts.lists(),
+        "times": drawn.times,
+        "rasterizer": drawn.rasterizer,
         "messages": transport.traffic(),
-        "per_frame": {f"{clock.stage}_s": clock.work_s} | counts.lists(),
+    }
+
+
+def _merged(drawn: Drawn, told: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """The statistics of the run of what each rank told: a stage takes as long as the slowest of its ranks."""
+    clocks = []
+    for stage in STAGES:
+        having = [of for of in told if stage in of["work_s"]]
+        if having:
+            clock = StageClock(stage)
+            clock.work_s = np.max([of["work_s"][stage] for of in having], axis=0).tolist()
+            clock.wait_s = [min(of["wait_s"][stage] for of in having)]
+            clocks.append(clock)
+    counts: dict[str, list[Any]] = {}
+    for of in told:
+        for name, values in of["counts"].items():
+            counts[name] = np.add(counts[name], values).tolist() if name in counts else values
+    messages: dict[str, dict[str, int]] = {}
+    for of in told:
+        for kind, count in of["messages"].items():
+            sums = messages.setdefault(kind, dict.fromkeys(count, 0))
+            messages[kind] = {unit: sums[unit] + n for unit, n in count.items()}
+    times = {name: values for of in told for name, values in of["times"].items()}
+    rasterizer = next(of["rasterizer"] for of in told if of["rasterizer"])
+    per_frame = {f"{clock.stage}_s": clock.work_s for clock in clocks} | counts | times
+    return drawn.record() | {
+        "rasterizer": rasterizer,
+        "stages": {clock.stage: clock.summary() for clock in clocks},
+        "per_frame": per_frame,
+        "ranks": [of["rank"] for of in told],
+        "messages": messages,
     }

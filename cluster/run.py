@@ -25,7 +25,7 @@ from .plan.workload import Workload
 from .progress import FrameProgress
 from .record import RECORD_VERSION, machine_record
 from .sink import prepare_output
-from .topologies import EQUAL_RANKS, FRAME_PARALLEL, check_world, ranks_to_start, role_of
+from .topologies import FRAME_PARALLEL, check_world, layout_of, ranks_to_start
 
 if TYPE_CHECKING:
     from .transport import Transport
@@ -97,7 +97,7 @@ def _run_rank(config_path: Path, overrides: list[str], json_path: Path | None) -
     status, why, role = 0, "", "starting"
     try:
         config = load_config(config_path, overrides)
-        role = role_of(config.pipeline, transport.rank)
+        role = _role_of(config, transport)
         record(rank=transport.rank, role=role, pid=os.getpid())
         expected = int(os.environ.get(EXPECTED_RANKS, 0))
         if expected and expected != transport.size:
@@ -147,28 +147,34 @@ def _run_rank(config_path: Path, overrides: list[str], json_path: Path | None) -
 
 def _run_topology(job: Job, transport: Transport, show: Callable[[str, int], None]) -> dict[str, Any] | None:
     """Do this rank's part of the run's topology; the statistics of the run on rank 0, None elsewhere. Collective."""
-    topology = job.config.pipeline.topology
-    if topology == "single":
+    pipeline = job.config.pipeline
+    if pipeline.topology == "single":
         from .pipeline import run_single
 
         result = run_single(job, show) if transport.rank == 0 else None
         transport.meet()
         return result
-    if topology not in EQUAL_RANKS:
-        from .pipeline import run_pipelined
-
-        return run_pipelined(job, transport, show)
-    ranks_here = transport.ranks_here()
+    layout = layout_of(pipeline, transport.size)
+    renders = pipeline.topology == FRAME_PARALLEL or transport.rank in layout.render
+    renders_here = transport.count_here(renders)
     if not job.config.render.threads:
-        job.threads = max(1, job.threads // ranks_here)
-    job.output.mkdir(parents=True, exist_ok=True)  # on a host of its own there may be no such folder yet
-    if topology == FRAME_PARALLEL:
+        job.threads = max(1, job.threads // max(renders_here, 1))
+    if renders:
+        job.output.mkdir(parents=True, exist_ok=True)  # on a host of its own there may be no such folder yet
+    if pipeline.topology == FRAME_PARALLEL:
         from .frame_parallel import run_frame_parallel
 
         return run_frame_parallel(job, transport, show)
-    from .sort_last import run_sort_last
+    from .pipeline import run_layout
 
-    return run_sort_last(job, transport, show)
+    return run_layout(job, layout, transport, show)
+
+
+def _role_of(config: RunConfig, transport: Transport) -> str:
+    """What this rank is called where it is named."""
+    if config.pipeline.topology == FRAME_PARALLEL:
+        return "pictures"
+    return layout_of(config.pipeline, transport.size).role_of(transport.rank)
 
 
 def _decided(pipeline: PipelineSection, ranks: int) -> Decision:

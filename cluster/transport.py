@@ -115,10 +115,10 @@ class Transport:
         self._comm.Allgatherv(np.ascontiguousarray(values, np.float64), [joined, counts])
         return joined
 
-    def ranks_here(self) -> int:
-        """How many ranks share this rank's host. Collective."""
+    def count_here(self, counted: bool) -> int:
+        """How many of the ranks that share this rank's host are to be counted. Collective."""
         here = self._comm.Split_type(self._mpi.COMM_TYPE_SHARED)
-        n = here.Get_size()
+        n = here.allreduce(int(counted))
         here.Free()
         return n
 

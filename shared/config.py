@@ -21,6 +21,7 @@ Vector = tuple[float, float, float]
 Matrix = list[list[float]]
 PositiveInt = Annotated[int, Field(ge=1)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Ranks = Annotated[int, Field(ge=0, le=65536)]
 
 
 AnySection = TypeVar("AnySection", bound=Section)
@@ -126,8 +127,23 @@ class SplatSection(Section):
 class PipelineSection(Section):
     """``[pipeline]``."""
 
-    topology: Literal["auto", "single", "pipelined", "frame-parallel", "sort-last-only"] = "auto"
-    ranks: Annotated[int, Field(ge=0, le=65536)] = 0
+    topology: Literal[
+        "auto",
+        "single",
+        "pipelined",
+        "master-slave",
+        "hybrid",
+        "sort-first",
+        "sort-last",
+        "sort-first-only",
+        "sort-last-only",
+        "frame-parallel",
+    ] = "auto"
+    ranks: Ranks = 0
+    culling_ranks: Ranks = 0
+    sampling_ranks: Ranks = 0
+    render_ranks: Ranks = 0
+    render_split: Literal["tiles", "shares"] = "tiles"
     frames_in_flight: Annotated[int, Field(ge=1, le=64)] = 4
     timeout_s: Positive = 300.0
 

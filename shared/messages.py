@@ -6,13 +6,13 @@ pickled, and no length is believed before it is checked against what has arrived
 =================  ============================  ============================================================
 message            from → to                     payload
 =================  ============================  ============================================================
-``Camera``         coordinator → all             clip_from_world, eye, viewport, near
+``FrameStart``     coordinator → all             camera (clip_from_world, eye, viewport, near), number of the plan
 ``VisibilityBits`` culling → sampling            1 bit a cell, breadth-first, packed (least significant first)
 ``RenderPoints``   sampling → render             entries of (offset, range, stride)
 ``SceneOffer``     sampling → render             ``scene.json`` and the colour mode
 ``SceneRequest``   render → sampling             array, first byte, number of bytes; nothing: no more is needed
 ``SceneBytes``     sampling → render             the bytes asked for, as they are stored
-``Framebuffer``    share → share                 words of pixels, by runs (``framebuffer_runs``)
+``Framebuffer``    render → render               words of pixels, by runs (``framebuffer_runs``)
 =================  ============================  ============================================================
 
 Those of scenes cross before the first frame, where ``scene.delivery`` is ``messages``. Their header has the number of
@@ -22,6 +22,7 @@ Protocol versions
     1. The first.
     2. Scenes by messages.
     3. Framebuffers.
+    4. Frames start by a plan.
 """
 
 from __future__ import annotations
@@ -38,13 +39,14 @@ from .errors import MessageError, StoreError
 from .scene_info import MAX_INFO_BYTES, SceneInfo, info_from_json
 
 MAGIC = b"SPLT"
-PROTOCOL_VERSION = 3
+PROTOCOL_VERSION = 4
 HEADER = struct.Struct("<4sHHQQ")
-_CAMERA = struct.Struct("<16d3d2Id")
+_FRAME_START = struct.Struct("<16d3d2IdI")
 _SCENE_REQUEST = struct.Struct("<IIQ")
 _MAX_COLOUR_BYTES = 64
 MAX_OFFER_BYTES = _MAX_COLOUR_BYTES + 1 + MAX_INFO_BYTES
 MAX_REQUEST_BYTES = _SCENE_REQUEST.size
+FRAME_START_BYTES = _FRAME_START.size
 SCENE_PIECE_BYTES = 8 << 20
 """Most bytes that one ``SceneRequest`` may ask for."""
 
@@ -61,7 +63,7 @@ distance along the view axis (positive, so its bits order as integers); the near
 class Kind(IntEnum):
     """Kind of a message."""
 
-    CAMERA = 1
+    FRAME_START = 1
     VISIBILITY = 2
     RENDER_POINTS = 3
     FRAME_DONE = 4
@@ -70,6 +72,20 @@ class Kind(IntEnum):
     SCENE_REQUEST = 7
     SCENE_BYTES = 8
     FRAMEBUFFER = 9
+    PLAN = 10
+
+
+@dataclass(frozen=True)
+class FrameStart:
+    """A frame is to be drawn: its camera, and the number of the plan (``cluster.layout.Plan``) that holds for it."""
+
+    camera: Camera
+    plan: int = 0
+
+    @property
+    def frame(self) -> int:
+        """Frame number."""
+        return self.camera.frame
 
 
 @dataclass(frozen=True)
@@ -158,7 +174,7 @@ class Framebuffer:
     runs: np.ndarray
 
 
-Message = Camera | VisibilityBits | RenderPoints | SceneOffer | SceneRequest | SceneBytes | Framebuffer
+Message = FrameStart | VisibilityBits | RenderPoints | SceneOffer | SceneRequest | SceneBytes | Framebuffer
 
 
 def header(kind: Kind, frame: int, length: int) -> bytes:
@@ -184,17 +200,19 @@ def parse_header(data: bytes | memoryview) -> tuple[Kind, int, int]:
 def encode(message: Message) -> tuple[bytes, memoryview]:
     """(header, payload) of a message. The payload is a view where the message holds an array: no copy."""
     match message:
-        case Camera():
+        case FrameStart():
+            camera = message.camera
             payload = memoryview(
-                _CAMERA.pack(
-                    *np.asarray(message.clip_from_world, np.float64).ravel(),
-                    *np.asarray(message.eye, np.float64),
-                    message.width,
-                    message.height,
-                    message.near,
+                _FRAME_START.pack(
+                    *np.asarray(camera.clip_from_world, np.float64).ravel(),
+                    *np.asarray(camera.eye, np.float64),
+                    camera.width,
+                    camera.height,
+                    camera.near,
+                    message.plan,
                 )
             )
-            return header(Kind.CAMERA, message.frame, len(payload)), payload
+            return header(Kind.FRAME_START, message.frame, len(payload)), payload
         case VisibilityBits():
             payload = np.ascontiguousarray(message.bits).data
             return header(Kind.VISIBILITY, message.frame, len(payload)), payload
@@ -218,11 +236,12 @@ def encode(message: Message) -> tuple[bytes, memoryview]:
 Bytes = bytes | bytearray | memoryview
 
 
-def decode_camera(frame: int, payload: Bytes) -> Camera:
-    """The camera of a payload. Raises MessageError for a wrong length."""
-    _expect(Kind.CAMERA, len(payload), _CAMERA.size)
-    v = _CAMERA.unpack(payload)
-    return Camera(frame, np.array(v[:16]).reshape(4, 4), np.array(v[16:19]), v[19], v[20], v[21])
+def decode_frame_start(frame: int, payload: Bytes) -> FrameStart:
+    """The start of a frame of a payload. Raises MessageError for a wrong length."""
+    _expect(Kind.FRAME_START, len(payload), _FRAME_START.size)
+    v = _FRAME_START.unpack(payload)
+    camera = Camera(frame, np.array(v[:16]).reshape(4, 4), np.array(v[16:19]), v[19], v[20], v[21])
+    return FrameStart(camera, v[22])
 
 
 def decode_visibility(frame: int, payload: Bytes, n_cells: int) -> VisibilityBits:

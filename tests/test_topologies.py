@@ -16,14 +16,13 @@ from hypothesis import strategies as st
 from splatpipe.cluster.job import Job
 from splatpipe.cluster.launch import find_mpiexec, mpi_available
 from splatpipe.cluster.plan.command import plan_command
-from splatpipe.cluster.sort_last import clip_entries
 from splatpipe.nodes.raster.cpu import CpuRasterizer
 from splatpipe.shared.build import BuildSettings, build_scene
 from splatpipe.shared.config import load_config
 from splatpipe.shared.errors import ConfigError, MessageError
 from splatpipe.shared.framebuffer_runs import encode_runs, merge_runs, most_bytes
 from splatpipe.shared.messages import FRAMEBUFFER_EMPTY, RENDER_POINT
-from splatpipe.shared.scene_share import SceneShare, share_borders
+from splatpipe.shared.scene_share import SceneShare, clip_entries, share_borders
 from splatpipe.shared.store import Scene
 from splatpipe.shared.synth import CityScan
 

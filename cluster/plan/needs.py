@@ -9,7 +9,7 @@ from typing import Any
 from ...shared.messages import FRAMEBUFFER_EMPTY, RENDER_POINT
 from ...shared.pooled import PoolCounts
 from ..job import Job
-from ..topologies import FRAME_PARALLEL, SORT_LAST_ONLY, ranks_to_start
+from ..topologies import FRAME_PARALLEL, layout_of, ranks_to_start
 from .costs import COSTS
 from .part import (
     ADAPTIVE,
@@ -102,14 +102,21 @@ def _delivery(job: Job, decision: Decision) -> Part:
 
 
 def _compositing(job: Job, work: Workload, decision: Decision) -> Part:
-    sent = work.pixels * FRAMEBUFFER_EMPTY.nbytes
-    if decision.topology == SORT_LAST_ONLY:
-        others = ranks_to_start(job.config.pipeline, decision.topology) - 1
-        why = f"{others} ranks send rank 0 what they have drawn, at most this; background is not sent"
-        return Part("compositing", False, why, others * sent, "bytes/frame", "counted")
+    sent, unit = work.pixels * FRAMEBUFFER_EMPTY.nbytes, "bytes/frame"
     if decision.topology == FRAME_PARALLEL:
-        return Part("compositing", True, "a picture is drawn by one rank", sent, "bytes/frame", "counted")
-    return Part("compositing", True, "one render rank: no framebuffer is sent", sent, "bytes/frame", "counted")
+        return Part("compositing", True, "a picture is drawn by one rank", sent, unit, "counted")
+    pipeline = job.config.pipeline
+    layout = layout_of(pipeline, ranks_to_start(pipeline, decision.topology))
+    others = len(layout.render) - 1
+    if decision.topology == "single" or not others:
+        return Part("compositing", True, "one render rank: no framebuffer is sent", sent, unit, "counted")
+    if layout.split == "tiles":
+        sent *= others / len(layout.render)
+        why = f"{others} ranks send rank {layout.display} their tiles, at most this; background is not sent"
+    else:
+        sent *= others
+        why = f"{others} ranks send rank {layout.display} what they have drawn, at most this; background is not sent"
+    return Part("compositing", False, why, sent, unit, "counted")
 
 
 def _back_face_test(job: Job, work: Workload) -> Part:
