@@ -251,6 +251,14 @@ def model_rank(
     rank_command(config, sets or [], output, rasterizer, render_rank)
 
 
+@app.command("machine-rank", hidden=True)
+def machine_rank(output: Path) -> None:
+    """One rank's part of `splatpipe predict --links`, which starts it."""
+    from .predict.machine import machine_rank
+
+    machine_rank(output)
+
+
 @app.command()
 def error(
     config: Annotated[Path, typer.Argument(help="TOML file: base run, scenes, sweeps; configs/error has examples.")],
@@ -302,6 +310,9 @@ def predict(
     best: Annotated[
         bool, typer.Option("--best", help="Of each setting the fastest repeat: for a machine that others work on.")
     ] = False,
+    links: Annotated[
+        bool, typer.Option("--links", help="Measure the link between the hosts that mpiexec uses, and predict with it.")
+    ] = False,
     json: JsonOption = None,
 ) -> None:
     """Frames/s, latency and bottleneck of other settings, cores and ranks, from costs fitted on a few measured runs.
@@ -311,10 +322,19 @@ def predict(
     from .predict.command import predict_command, validate_command
 
     if validate:
-        validate_command(config, fresh=fresh, best=best, json_path=json)
+        validate_command(config, fresh=fresh, best=best, links=links, json_path=json)
     else:
         predict_command(
-            config, sets or [], what_if or [], ranks, repeats, output, fresh=fresh, best=best, json_path=json
+            config,
+            sets or [],
+            what_if or [],
+            ranks,
+            repeats,
+            output,
+            fresh=fresh,
+            best=best,
+            links=links,
+            json_path=json,
         )
 
 
