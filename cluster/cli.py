@@ -302,7 +302,10 @@ def predict(
     ] = None,
     ranks: Annotated[int, typer.Option(help="On paper, up to this many ranks.", min=3, max=1 << 16)] = 4096,
     repeats: Annotated[int, typer.Option(help="Runs of each calibration setting.", min=1)] = 3,
-    output: Annotated[Path, typer.Option("--output", "-o", help="Calibration runs and report.")] = Path("predicted"),
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="Runs and report; default: predicted, or where the experiment says."),
+    ] = None,
     validate: Annotated[
         bool, typer.Option("--validate", help="Predicted beside measured, over an experiment.")
     ] = False,
@@ -321,21 +324,11 @@ def predict(
     """
     from .predict.command import predict_command, validate_command
 
+    settings = {"fresh": fresh, "best": best, "links": links, "json_path": json}
     if validate:
-        validate_command(config, fresh=fresh, best=best, links=links, json_path=json)
+        validate_command(config, output, **settings)
     else:
-        predict_command(
-            config,
-            sets or [],
-            what_if or [],
-            ranks,
-            repeats,
-            output,
-            fresh=fresh,
-            best=best,
-            links=links,
-            json_path=json,
-        )
+        predict_command(config, sets or [], what_if or [], ranks, repeats, output or Path("predicted"), **settings)
 
 
 @bench_app.command("raster")

@@ -90,14 +90,15 @@ def predict_command(
 
 
 def validate_command(
-    file: Path, *, fresh: bool = False, best: bool = False, links: bool = False, json_path: Path | None = None,
-    runner: Runner = measured_run,
+    file: Path, output: Path | None = None, *, fresh: bool = False, best: bool = False, links: bool = False,
+    json_path: Path | None = None, runner: Runner = measured_run,
 ) -> None:  # fmt: skip
     """Run an experiment and the calibration of its scenes, interleaved; say how far the predictions were off.
 
+    output : for runs and report, if not where the experiment says.
     links : whether to measure the link between hosts first.
     """
-    own = load_experiment(file)
+    own = load_experiment(file, output)
     machine = _machine(max(Setting.of(run).size for run in own.runs), links)
     experiment = extended(own)
     measured = _measure(experiment, fresh, best, runner)

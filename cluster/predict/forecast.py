@@ -76,7 +76,7 @@ def forecast(costs: Costs, load: Workload | Parts, setting: Setting, machine: Ma
     by_one = [step.seconds(n_frames, waiting=False) for step in one]
     pools = [None if step.rank is None else machine.pool_of(step.rank) for step in steps]
     crowded = len({rank for rank in layout.workers if machine.pool_of(rank) == machine.pool_of(0)}) > 1
-    factor = [1.0] * len(steps)
+    factor = [_inflation(step.threads, costs.contention, machine.cores) for step in steps]
     for _ in range(ROUNDS):
         stages = []
         for i, step in enumerate(steps):
