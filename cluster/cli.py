@@ -50,6 +50,9 @@ def run(
     sets: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a key: output.frames=10.")
     ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with a run that was cut short: draw only what is missing.")
+    ] = False,
     json: JsonOption = None,
 ) -> None:
     """Draw a camera path: PNG frames, a film, and run.json with where the time went.
@@ -60,7 +63,7 @@ def run(
     """
     from .run import run_command
 
-    raise typer.Exit(run_command(config, sets or [], json))
+    raise typer.Exit(run_command(config, [*(sets or []), *["output.resume=true"] * resume], json))
 
 
 @app.command()
@@ -510,6 +513,35 @@ def bench_pipeline(
     from .bench.pipeline import print_pipeline
 
     _report(measure(config, sets or [], repeats), print_pipeline, json)
+
+
+@bench_app.command("compositing")
+def bench_compositing(
+    ranks: Annotated[str, typer.Option(metavar="N,N,…", help="Numbers of ranks, each at least 2.")] = "2,4",
+    sizes: Annotated[str, typer.Option(metavar="WIDTHxHEIGHT,…", help="Pictures, pixels.")] = "1280x720",
+    coverages: Annotated[str, typer.Option(metavar="%,%,…", help="Pixels that a rank has drawn on.")] = "10,50",
+    policies: Annotated[str, typer.Option(metavar="NAME,…", help="Of pipeline.compositing; all of them.")] = "",
+    empty: Annotated[float, typer.Option(help="Ranks that have drawn nothing, %.", min=0, max=99)] = 0,
+    radix: Annotated[int, typer.Option(help="Of radix-k.", min=2, max=1024)] = 8,
+    frames: Annotated[int, typer.Option(help="Timed frames of each policy.", min=1)] = 15,
+    plot: Annotated[Path | None, typer.Option(help="PNG file: measured and model, and the model by ranks.")] = None,
+    json: JsonOption = None,
+) -> None:
+    """Policies of sort-last compositing on ranks started here, beside the model and radix-k's published figure.
+
+    Exit status 1 if one policy's picture has other bits than another's.
+
+    Example: `splatpipe bench compositing --ranks 2,3,4 --sizes 1280x720,1920x1080 --json compositing.json`
+    """
+    from .bench.compositing import bench_compositing as measure
+    from .bench.compositing import parse_cases, plot_compositing, print_compositing
+
+    cases = parse_cases(ranks, sizes, parse_numbers(coverages, "--coverages"), policies)
+    found = measure(**cases, radix=radix, frames=frames, empty=empty / 100)
+    if plot is not None:
+        plot_compositing(found, plot)
+    _report(found, print_compositing, json)
+    raise typer.Exit(int(not all(row["same_bits"] for row in found["rows"])))
 
 
 @bench_app.command("lod")

@@ -2,21 +2,24 @@
 
 Picture i of those to be drawn goes to rank i mod n: neighbours on a camera path take about as long, so that ranks end
 together. Rank 0 hears of each frame that another rank has drawn, and at the end of everything that rank has counted and
-timed.
+timed. Where there is a film, rank 0 is sent its pictures (``film``).
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from ..shared.messages import Kind
+from .film import GatheredFilm, SentFilm
 from .job import Job
 from .layout import ALONE
 from .pipeline import Drawn, FrameLoop, Progress
-from .record import FrameCounts, StageClock, rank_record
+from .record import FrameCounts, StageClock, rank_record, summed_traffic
+from .sink import Film
 from .transport import Transport
 
 
@@ -30,11 +33,19 @@ def run_frame_parallel(job: Job, transport: Transport, progress: Progress) -> di
     views, whole = job.views.per_picture, job.frames
     frames = [frames_of(whole, views, rank, transport.size) for rank in range(transport.size)]
     job.frames = frames[transport.rank]
+    job.make_film = _film_maker(job, frames, transport)
     work = _first_rank if transport.rank == 0 else _other_rank
     result = work(job, frames, transport, progress)
     transport.finish()
     job.frames = whole
     return result
+
+
+def _film_maker(job: Job, frames: list[list[int]], transport: Transport) -> Callable[[Path, float], Film]:
+    pictures = [[frame // job.views.per_picture for frame in of[:: job.views.per_picture]] for of in frames]
+    if transport.rank:
+        return lambda path, fps: SentFilm(transport, pictures[transport.rank])
+    return lambda path, fps: GatheredFilm(path, fps, transport, pictures, *job.picture_size)
 
 
 def _other_rank(job: Job, frames: list[list[int]], transport: Transport, _: Progress) -> None:
@@ -82,6 +93,7 @@ def _told(drawn: Drawn, transport: Transport) -> dict[str, Any]:
         "counts": drawn.counts.lists(),
         "times": drawn.times,
         "latency_s": drawn.latency_s,
+        "messages": transport.traffic(),
     }
 
 
@@ -103,5 +115,6 @@ def _merged(drawn: Drawn, told: list[dict[str, Any]], frames: list[list[int]]) -
     counts = FrameCounts({name: in_order([of["counts"].get(name, []) for of in told]) for name in names})
     times = {name: [value for of in told for value in of["times"].get(name, [])] for name in told[0]["times"]}
     latency_s = in_order([of["latency_s"] for of in told])
+    messages = summed_traffic(of["messages"] for of in told)
     merged = replace(drawn, clocks=clocks, counts=counts, times=times, latency_s=latency_s)
-    return merged.record() | {"ranks": [of["rank"] for of in told], "messages": {}}
+    return merged.record() | {"ranks": [of["rank"] for of in told], "messages": messages}

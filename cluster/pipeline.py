@@ -34,13 +34,15 @@ from ..shared.messages import (
     decode_visibility,
 )
 from ..shared.scene_share import SceneShare
-from .compositing import Assembler, make_assembler
+from .compositing import make_compositor
+from .compositing.tiles import Tiles
 from .delivery import receive_scene, serve_scene
 from .job import Job, RenderStage
 from .layout import ALONE, Layout, Plan
-from .record import FrameCounts, StageClock, rank_record, spread_ms
+from .record import FrameCounts, StageClock, rank_record, spread_ms, summed_traffic
 from .selection import CullingPart, LaneCells, SamplingPart, first_plan, merged_entries, shares_of
 from .transport import Transport
+from .wall import writes_screens
 
 STAGES = ("culling", "sampling", "render", "compositing", "picture")
 CULLING, SAMPLING, RENDER = range(3)
@@ -229,10 +231,23 @@ class FrameLoop:
             job.colouring = job.colouring.with_range_of(transport.join(sample))
         if not self._renders:
             return None
-        self._assembler: Assembler | None = None
-        if self._transport and len(self._layout.render) > 1:
-            self._assembler = make_assembler(job.config.pipeline, self._layout, self._transport)
-        return stack.enter_context(job.open_render(self._progress, share, shown=self._shows))
+        screen = job.wall.screens[number] if job.wall and writes_screens(job, self._layout) else None
+        self._waits_for_screens = self._transport if screen else None
+        self._meet = None if screen else self._meeting()
+        shown = self._shows or screen is not None
+        return stack.enter_context(job.open_render(self._progress, share, shown=shown, screen=screen))
+
+    def _meeting(self) -> Callable[[int, np.ndarray], np.ndarray | None] | None:
+        """What takes a frame's number and the words of all render ranks to those of the picture, on the display rank;
+        None where one rank has it all.
+        """
+        ranks, transport, pipeline = self._layout.render, self._transport, self._job.config.pipeline
+        if transport is None or len(ranks) == 1:
+            return None
+        if self._layout.split == "tiles":
+            side_by_side = Tiles(transport, ranks)
+            return lambda frame, words: side_by_side.assemble(frame, words, self._plan.windows)
+        return make_compositor(pipeline.compositing, transport, ranks, radix=pipeline.radix).composite
 
     def _warm_up_selection(self) -> None:
         """Compile what selecting needs, or load what was compiled."""
@@ -299,16 +314,27 @@ class FrameLoop:
             of_layers = [self._take_entries(layout.lanes[0].sampling[0], len(layer.octree)) for layer in layers]
         with clock.working():
             words = render.rasterize(camera, merged_entries(camera.frame, received))
-            picture = render.compose(camera, words, of_layers) if not self._assembler and self._shows else None
-        if self._assembler:
+            picture = None if self._meet else render.compose(camera, words, of_layers)
+        if self._meet:
             with self._clocks["compositing"].working():
-                whole = self._assembler.assemble(camera.frame, words, self._plan.windows)
+                whole = self._meet(camera.frame, words)
             if whole is not None:
                 with self._clocks["picture"].working():
                     picture = render.compose(camera, whole, of_layers)
         with clock.waiting():
             render.show(camera.frame, picture)
+            if self._waits_for_screens:
+                self._meet_screens(self._waits_for_screens, camera.frame)
         self._counts.add_layers(of_layers)
+
+    def _meet_screens(self, transport: Transport, frame: int) -> None:
+        """On the display rank: wait for every other screen's part of a frame, so that it is done when all are."""
+        display, *others = self._layout.render
+        if self._rank != display:
+            transport.send_note(display, Kind.FRAME_DONE, frame)
+            return
+        for rank in others:
+            transport.receive_note(rank, Kind.FRAME_DONE)
 
     # --- between stages ----------------------------------------------------------------------------------------------
 
@@ -410,12 +436,8 @@ def _merged(drawn: Drawn, told: Sequence[dict[str, Any]]) -> dict[str, Any]:
     for of in told:
         for name, values in of["counts"].items():
             counts[name] = np.add(counts[name], values).tolist() if name in counts else values
-    messages: dict[str, dict[str, int]] = {}
-    for of in told:
-        for kind, count in of["messages"].items():
-            sums = messages.setdefault(kind, dict.fromkeys(count, 0))
-            messages[kind] = {unit: sums[unit] + n for unit, n in count.items()}
-    times = {name: values for of in told for name, values in of["times"].items()}
+    names = dict.fromkeys(name for of in told for name in of["times"])
+    times = {name: [s for of in told for s in of["times"].get(name, [])] for name in names}
     rasterizer = next(of["rasterizer"] for of in told if of["rasterizer"])
     per_frame = {f"{clock.stage}_s": clock.work_s for clock in clocks} | counts | times
     return drawn.record() | {
@@ -423,5 +445,5 @@ def _merged(drawn: Drawn, told: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "stages": {clock.stage: clock.summary() for clock in clocks},
         "per_frame": per_frame,
         "ranks": [of["rank"] for of in told],
-        "messages": messages,
+        "messages": summed_traffic(of["messages"] for of in told),
     }

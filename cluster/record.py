@@ -7,7 +7,7 @@ import platform
 import resource
 import subprocess
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -86,6 +86,17 @@ def spread_ms(seconds: list[float]) -> dict[str, float]:
     return dict(zip(names, (float(v) for v in np.percentile(values, [50, 0, 95, 100])), strict=True))
 
 
+def summed_traffic(of_ranks: Iterable[Mapping[str, Mapping[str, int]]]) -> dict[str, dict[str, int]]:
+    """Messages and bytes that ranks have sent together, by kind."""
+    sums: dict[str, dict[str, int]] = {}
+    for traffic in of_ranks:
+        for kind, counts in traffic.items():
+            of_kind = sums.setdefault(kind, {})
+            for unit, n in counts.items():
+                of_kind[unit] = of_kind.get(unit, 0) + n
+    return sums
+
+
 def rank_record(role: str, rank: int) -> dict[str, Any]:
     """Who this rank is: role, host, process, cores it may use, resident memory now and at its peak so far."""
     return {
@@ -108,7 +119,7 @@ def machine_record() -> dict[str, Any]:
         "system": f"{platform.system()} {platform.release()}",
         "python": platform.python_version(),
         "commit": _commit(),
-        "versions": {name: _version(name) for name in ("splatpipe", "numpy", "numba", "mpi4py", "moderngl")},
+        "versions": {name: package_version(name) for name in ("splatpipe", "numpy", "numba", "mpi4py", "moderngl")},
     }
 
 
@@ -132,7 +143,8 @@ def _commit() -> str | None:
         return None
 
 
-def _version(name: str) -> str | None:
+def package_version(name: str) -> str | None:
+    """Version of an installed package, None where it is not installed."""
     try:
         return version(name)
     except PackageNotFoundError:

@@ -23,6 +23,7 @@ from ..shared.scene_share import clip_entries, share_borders
 from ..shared.windows import Window, tiles
 from .job import Job
 from .layout import Lane, Layout, Plan
+from .wall import screen_windows
 
 SUBTREES_PER_RANK = 16
 """Least subtrees for each rank that they are dealt to: enough for even parts, few enough for few shared ancestors."""
@@ -64,13 +65,14 @@ def shares_of(layout: Layout, whole: Octree) -> list[tuple[int, int]]:
 
 
 def first_plan(job: Job, layout: Layout, lanes: Sequence[LaneCells]) -> Plan:
-    """The plan to begin with: even cells, even tiles.
+    """The plan to begin with: even cells, even tiles, or the screens of a wall.
 
     lanes : none on a rank that selects nothing, which need not know who does.
     """
     windows: list[Window] = []
     if layout.split == "tiles":
-        windows = tiles(job.views.width, job.views.height, [1.0] * len(layout.render))
+        windows = screen_windows(job, layout)
+        windows = windows or tiles(job.views.width, job.views.height, [1.0] * len(layout.render))
     return Plan(
         0,
         tuple(cells.borders(cells.parts[0]) for cells in lanes),
@@ -135,12 +137,14 @@ class SamplingPart:
         self._n_renders = len(renders)
 
     def process(self, camera: Camera, received: Sequence[VisibilityBits]) -> tuple[RenderPoints, list[RenderPoints]]:
-        """(everything chosen, by the numbers of the scene; what each render rank of the lane draws of it)."""
+        """(everything chosen of the lane's points; what each render rank of the lane draws of it)."""
         chosen = self._node.process(camera, self._merged(camera.frame, received))
         if self._windows:
             return chosen, self._node.within(camera, self._windows)
         if self._shares:
-            return chosen, [RenderPoints(camera.frame, clip_entries(chosen.entries, *of)) for of in self._shares]
+            of_shares = [RenderPoints(camera.frame, clip_entries(chosen.entries, *of)) for of in self._shares]
+            mine = np.concatenate([of.entries for of in of_shares])  # cells above a lane's own points are others'
+            return RenderPoints(camera.frame, mine), of_shares
         return chosen, [chosen] * self._n_renders
 
     def _merged(self, frame: int, received: Sequence[VisibilityBits]) -> VisibilityBits:

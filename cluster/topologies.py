@@ -54,8 +54,6 @@ def check_topology(config: RunConfig) -> None:
         raise ConfigError(f"scene.delivery = 'messages': {topology}: every rank opens the scene, expected 'files'")
     if pipeline.topology in CHAIN and pipeline.ranks in (1, 2) and config.scene.delivery == "messages":
         raise ConfigError(f"pipeline.ranks = {pipeline.ranks}: scene.delivery = 'messages' takes three")
-    if pipeline.topology == FRAME_PARALLEL and config.output.mp4:
-        raise ConfigError(f"output.mp4 = true: {topology}: no rank has all pictures in order, expected false")
     splits = SPLIT.get(pipeline.topology, pipeline.render_split if pipeline.topology == "hybrid" else "none")
     refused = {
         "render.style = 'splats'": splits != "none" and config.render.style == "splats",
@@ -94,3 +92,8 @@ def check_world(pipeline: PipelineSection, size: int) -> None:
 
 def _counts(pipeline: PipelineSection) -> tuple[int, int, int]:
     return pipeline.culling_ranks, pipeline.sampling_ranks, pipeline.render_ranks
+
+
+def role_of(pipeline: PipelineSection, rank: int, size: int) -> str:
+    """What a rank of ``size`` is called where it is named."""
+    return "pictures" if pipeline.topology == FRAME_PARALLEL else layout_of(pipeline, size).role_of(rank)

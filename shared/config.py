@@ -24,6 +24,19 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Ranks = Annotated[int, Field(ge=0, le=65536)]
 
 
+Topology = Literal[
+    "auto",
+    "single",
+    "pipelined",
+    "master-slave",
+    "hybrid",
+    "sort-first",
+    "sort-last",
+    "sort-first-only",
+    "sort-last-only",
+    "frame-parallel",
+]
+
 AnySection = TypeVar("AnySection", bound=Section)
 
 
@@ -71,6 +84,17 @@ class CameraSection(Section):
     sweep_deg: float = 360.0
     keyframes: list[Keyframe] = Field(default=[])
     poses: list[Matrix] = Field(default=[])
+
+
+class WallSection(Section):
+    """``[wall]``."""
+
+    columns: Annotated[int, Field(ge=1, le=256)] = 1
+    rows: Annotated[int, Field(ge=1, le=256)] = 1
+    mullion_x_px: Annotated[int, Field(ge=0, le=4096)] = 0
+    mullion_y_px: Annotated[int, Field(ge=0, le=4096)] = 0
+    output: Literal["assembled", "tiles"] = "assembled"
+    mullion_colour: str = "#000000"
 
 
 class FilterSection(Section):
@@ -127,25 +151,18 @@ class SplatSection(Section):
 class PipelineSection(Section):
     """``[pipeline]``."""
 
-    topology: Literal[
-        "auto",
-        "single",
-        "pipelined",
-        "master-slave",
-        "hybrid",
-        "sort-first",
-        "sort-last",
-        "sort-first-only",
-        "sort-last-only",
-        "frame-parallel",
-    ] = "auto"
+    topology: Topology = "auto"
     ranks: Ranks = 0
     culling_ranks: Ranks = 0
     sampling_ranks: Ranks = 0
     render_ranks: Ranks = 0
     render_split: Literal["tiles", "shares"] = "tiles"
     frames_in_flight: Annotated[int, Field(ge=1, le=64)] = 4
+    compositing: Literal["auto", "direct", "direct-reduce", "binary-swap", "radix-k", "mpi-min"] = "auto"
+    radix: Annotated[int, Field(ge=2, le=1024)] = 8
     timeout_s: Positive = 300.0
+    loading_timeout_s: Positive = 3600.0
+    survive: bool = True
 
 
 class OutputSection(Section):
@@ -159,6 +176,7 @@ class OutputSection(Section):
     mp4: bool = False
     depth: bool = False
     normals: bool = False
+    resume: bool = False
 
 
 class RunConfig(Section):
@@ -166,6 +184,7 @@ class RunConfig(Section):
 
     scene: SceneSection = SceneSection()
     camera: CameraSection = CameraSection()
+    wall: WallSection = WallSection()
     filter: FilterSection = FilterSection()
     culling: CullingSection = CullingSection()
     sampling: SamplingSection = SamplingSection()

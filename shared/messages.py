@@ -12,7 +12,8 @@ message            from → to                     payload
 ``SceneOffer``     sampling → render             ``scene.json`` and the colour mode
 ``SceneRequest``   render → sampling             array, first byte, number of bytes; nothing: no more is needed
 ``SceneBytes``     sampling → render             the bytes asked for, as they are stored
-``Framebuffer``    render → render               words of pixels, by runs (``framebuffer_runs``)
+``Framebuffer``    render → render               words of pixels, by runs (``framebuffer_runs``); none: background
+``FilmPicture``    render → rank 0               8-bit red, green, blue of each pixel
 =================  ============================  ============================================================
 
 Those of scenes cross before the first frame, where ``scene.delivery`` is ``messages``. Their header has the number of
@@ -22,7 +23,7 @@ Protocol versions
     1. The first.
     2. Scenes by messages.
     3. Framebuffers.
-    4. Frames start by a plan.
+    4. Frames start by a plan; pictures of films.
 """
 
 from __future__ import annotations
@@ -73,6 +74,7 @@ class Kind(IntEnum):
     SCENE_BYTES = 8
     FRAMEBUFFER = 9
     PLAN = 10
+    FILM_PICTURE = 11
 
 
 @dataclass(frozen=True)
@@ -174,7 +176,17 @@ class Framebuffer:
     runs: np.ndarray
 
 
-Message = FrameStart | VisibilityBits | RenderPoints | SceneOffer | SceneRequest | SceneBytes | Framebuffer
+@dataclass(frozen=True)
+class FilmPicture:
+    """A picture of a film. frame : number of the picture.  rgb : (h, w, 3) uint8."""
+
+    frame: int
+    rgb: np.ndarray
+
+
+Message = (
+    FrameStart | VisibilityBits | RenderPoints | SceneOffer | SceneRequest | SceneBytes | Framebuffer | FilmPicture
+)
 
 
 def header(kind: Kind, frame: int, length: int) -> bytes:
@@ -231,6 +243,9 @@ def encode(message: Message) -> tuple[bytes, memoryview]:
         case Framebuffer():
             payload = np.ascontiguousarray(message.runs).data
             return header(Kind.FRAMEBUFFER, message.frame, len(payload)), payload
+        case FilmPicture():
+            payload = np.ascontiguousarray(message.rgb).reshape(-1).data
+            return header(Kind.FILM_PICTURE, message.frame, len(payload)), payload
 
 
 Bytes = bytes | bytearray | memoryview

@@ -29,6 +29,19 @@ class Window(NamedTuple):
         """(y1 − y0, x1 − x0): a view of the window's part of a picture's (height, width) words."""
         return words[self.y0 : self.y1, self.x0 : self.x1]
 
+    def grown(self, margin: int, width: int, height: int) -> Window:
+        """With a margin on each side, as far as a picture of this size reaches."""
+        x0, y0, x1, y1 = self
+        return Window(max(x0 - margin, 0), max(y0 - margin, 0), min(x1 + margin, width), min(y1 + margin, height))
+
+    def scaled(self, factor: int) -> Window:
+        """In a picture of ``factor`` times the width and height."""
+        return Window(*(factor * side for side in self))
+
+    def seen_from(self, other: Window) -> Window:
+        """In what ``other`` cuts out."""
+        return Window(self.x0 - other.x0, self.y0 - other.y0, self.x1 - other.x0, self.y1 - other.y0)
+
 
 def tiles(width: int, height: int, weights: Sequence[float]) -> list[Window]:
     """Windows without overlap that fill a picture, one for each weight, their areas near the weights' shares.

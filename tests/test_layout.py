@@ -273,10 +273,9 @@ def test_windows_see_together_what_the_picture_sees(scene, n):
     seen = [points_named(part.entries) for part in node.within(camera, windows)]
     assert set().union(*seen) == whole
     for window, points in zip(windows, seen, strict=True):
-        culled = culling.process(camera, window)
-        assert (culled.unpack() <= bits.unpack()).all()
-        alone = SamplingNode(cloud.octree, pixel_threshold=8).process(camera, culled)
-        assert points_named(alone.entries) == points, "culled to a window or split afterwards"
+        alone = SamplingNode(cloud.octree, pixel_threshold=8).process(camera, culling.process(camera, window))
+        # behind the eye a window's planes may leave what one of the picture's rejects
+        assert points_named(alone.entries) & whole == points, "culled to a window or split afterwards"
 
 
 def points_named(entries) -> set[int]:

@@ -1,38 +1,26 @@
-"""The framebuffers of render ranks meet on the display rank. One policy a file.
+"""The framebuffers of render ranks meet on the first of them. One policy a file.
 
-``tiles``: each has the words of its window.  ``direct`` and the others: sort-last, the minimum of words.
+Sort-last, in the minimum of words:
+
+=============  ====================================================================================================
+choose         ``make_compositor``: a policy by name; ``auto`` takes the one that the model says is done first
+direct         every rank sends to the root
+rounds         what the next three share: rounds of exchanges within groups, then the root gathers
+direct_reduce  one round, the group is all: each rank is sent its part of the picture by all others (direct-send)
+binary_swap    groups of two
+radix_k        groups of up to k (Peterka, Goodell, Ross, Shen, Thakur 2009)
+mpi_min        MPI_Reduce with MPI_MIN: the reference
+exchange       what crosses between two ranks, and what a rank holds of the picture
+model          seconds, bytes and messages of each policy, as functions of ranks, pixels and links
+=============  ====================================================================================================
+
+Sort-first, side by side: ``tiles``.
+
+Minimum is commutative and associative: all policies give the same bits. Background is not sent; a part of a picture on
+which a rank has drawn nothing is a header without payload.
 """
 
-from __future__ import annotations
+from .choose import make_compositor
+from .exchange import Compositor
 
-from collections.abc import Sequence
-from typing import Protocol
-
-import numpy as np
-
-from ...shared.config import PipelineSection
-from ...shared.windows import Window
-from ..layout import Layout
-from ..transport import Transport
-
-
-class Assembler(Protocol):
-    """Brings together what the render ranks have drawn of a frame."""
-
-    def assemble(self, frame: int, words: np.ndarray, windows: Sequence[Window]) -> np.ndarray | None:
-        """(height, width) uint64 words of all render ranks on the display rank, None elsewhere; collective.
-
-        words : what this rank has drawn, not changed.  windows : of each render rank, where they draw tiles.
-        """
-        ...
-
-
-def make_assembler(pipeline: PipelineSection, layout: Layout, transport: Transport) -> Assembler:
-    """How the framebuffers of a layout's render ranks meet."""
-    if layout.split == "tiles":
-        from .tiles import Tiles
-
-        return Tiles(transport, layout.render)
-    from .direct import Direct
-
-    return Direct(transport, layout.render)
+__all__ = ["Compositor", "make_compositor"]

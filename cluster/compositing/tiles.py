@@ -1,5 +1,5 @@
-"""Tiles: every render rank sends the words of its window, background left out, and the display rank lays them side by
-side. Where a rank drew nothing in its window, a head is all that crosses.
+"""Tiles: every render rank sends the words of its window, and the display rank lays them side by side. What is in no
+window stays background.
 """
 
 from __future__ import annotations
@@ -8,11 +8,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ...shared.errors import MessageError
-from ...shared.framebuffer_runs import encode_runs, merge_runs, most_bytes
-from ...shared.messages import FRAMEBUFFER_EMPTY, Framebuffer, Kind
+from ...shared.framebuffer_runs import merge_runs
+from ...shared.messages import FRAMEBUFFER_EMPTY
 from ...shared.windows import Window
 from ..transport import Transport
+from .exchange import receive_part, send_part
 
 
 class Tiles:
@@ -24,20 +24,24 @@ class Tiles:
         self._whole = np.empty((0, 0), np.uint64)
 
     def assemble(self, frame: int, words: np.ndarray, windows: Sequence[Window]) -> np.ndarray | None:
-        """As of ``Assembler``. Raises MessageError for what is no framebuffer of this frame and window."""
+        """(height, width) uint64 words of all windows on the first rank, None elsewhere; collective.
+
+        words : what this rank has drawn, not changed.  What is returned is valid until the next call.
+        Raises MessageError for what is no framebuffer of this frame and window.
+        """
         mine = self._ranks.index(self._transport.rank)
         if mine:
-            runs = encode_runs(np.ascontiguousarray(windows[mine].of(words)).reshape(-1))
-            self._transport.send(self._ranks[0], Framebuffer(frame, runs))
+            part = np.ascontiguousarray(windows[mine].of(words)).reshape(-1)
+            send_part(self._transport, self._ranks[0], frame, part)
             return None
         if self._whole.shape != words.shape:
-            self._whole = np.empty_like(words)
+            self._whole = np.full_like(words, FRAMEBUFFER_EMPTY)
         windows[0].of(self._whole)[:] = windows[0].of(words)
         for rank, window in zip(self._ranks[1:], windows[1:], strict=True):
-            received = self._transport.receive(rank, Kind.FRAMEBUFFER, most_bytes(window.n_pixels))
-            if received.frame != frame:
-                raise MessageError(f"framebuffer of rank {rank}: found frame {received.frame}, expected frame {frame}")
+            payload = receive_part(self._transport, rank, frame, window.n_pixels)
             tile = np.full(window.n_pixels, FRAMEBUFFER_EMPTY)
-            merge_runs(received.payload, tile)
-            window.of(self._whole)[:] = tile.reshape(window.y1 - window.y0, -1)
+            if len(payload):
+                merge_runs(payload, tile)
+            part = window.of(self._whole)
+            part[:] = tile.reshape(part.shape)
         return self._whole

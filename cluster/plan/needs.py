@@ -10,6 +10,7 @@ from ...shared.messages import FRAMEBUFFER_EMPTY, RENDER_POINT
 from ...shared.pooled import PoolCounts
 from ..job import Job
 from ..topologies import FRAME_PARALLEL, layout_of, ranks_to_start
+from ..wall import writes_screens
 from .costs import COSTS
 from .part import (
     ADAPTIVE,
@@ -110,6 +111,8 @@ def _compositing(job: Job, work: Workload, decision: Decision) -> Part:
     others = len(layout.render) - 1
     if decision.topology == "single" or not others:
         return Part("compositing", True, "one render rank: no framebuffer is sent", sent, unit, "counted")
+    if writes_screens(job, layout):
+        return Part("compositing", True, "wall.output is tiles: a screen is written by one rank", sent, unit, "counted")
     if layout.split == "tiles":
         sent *= others / len(layout.render)
         why = f"{others} ranks send rank {layout.display} their tiles, at most this; background is not sent"

@@ -16,6 +16,7 @@ from ...shared.messages import RENDER_POINT
 from ..job import Job
 from ..launch import mpi_available
 from ..topologies import CHAIN, FRAME_PARALLEL, layout_of, ranks_to_start
+from ..wall import writes_screens
 from .costs import COSTS, UnitCosts, compose_core_s, draw_core_s
 from .workload import Workload
 
@@ -123,13 +124,16 @@ def _said(job: Job, topology: str) -> str:
     pipeline = job.config.pipeline
     ranks = ranks_to_start(pipeline, topology)
     if topology == FRAME_PARALLEL:
-        return f": each of {ranks} ranks opens the whole scene, and draws and writes whole pictures in turn"
+        film = "; rank 0 makes the film" if job.config.output.mp4 else ""
+        return f": each of {ranks} ranks opens the whole scene, and draws and writes whole pictures in turn{film}"
     layout = layout_of(pipeline, ranks)
     culling, sampling = (len({r for lane in layout.lanes for r in getattr(lane, s)}) for s in ("culling", "sampling"))
     said = f": {ranks} ranks, {culling} cull, {sampling} sample, {len(layout.render)} render"
     if layout.split == "shares":
         share = job.scene.info.n_stored / len(layout.render)
         return f"{said} about {share:,.0f} of the stored points each; rank {layout.display} composites"
+    if writes_screens(job, layout):
+        return f"{said} a screen of the wall each, and write it"
     return said + (f" a tile each; rank {layout.display} has the picture" if layout.split == "tiles" else "")
 
 
