@@ -104,11 +104,23 @@ def test_links_that_cost_nothing_are_as_if_there_were_none(topology):
 @pytest.mark.parametrize("n", [2, 3, 7])
 def test_where_only_links_cost_framebuffers_arrive_at_the_rate_of_one_link(topology, split, n):
     load, link = load_of(n_frames=400), 12.5e6
-    found = forecast(FREE, load, Setting(topology, 1, 4, n), Machine(64, hosts=n, link_bytes_per_s=link))
+    setting = Setting(topology, 1, 4, n, compositing="direct")
+    found = forecast(FREE, load, setting, Machine(64, hosts=n, link_bytes_per_s=link))
     arriving = (n - 1) * EvenParts(load).of(split, n)[0].filled_bytes.mean()
     assert found.frames_per_s == pytest.approx(link / arriving, rel=0.02)
     assert found.limit[1] == "(2) external bandwidth"
     assert found.schedule.utilisation["link into host 1"] == pytest.approx(1, abs=0.02)
+
+
+@pytest.mark.parametrize("policy", ["direct-reduce", "binary-swap", "radix-k"])
+def test_compositing_in_rounds_is_never_slower_than_the_link_of_the_display_allows_nor_than_direct(policy):
+    load, link = load_of(n_frames=100), 12.5e6
+    machine = Machine(64, hosts=8, link_bytes_per_s=link)
+    rates = {
+        name: forecast(FREE, load, Setting("sort-last-only", 1, 4, 8, compositing=name), machine).frames_per_s
+        for name in ("direct", policy)
+    }
+    assert rates["direct"] < rates[policy] < link / (load.pixels * 8 * 0.5), "half of the picture's words must arrive"
 
 
 def test_the_message_of_the_thesis_over_its_link():

@@ -67,9 +67,9 @@ def forecast(costs: Costs, load: Workload | Parts, setting: Setting, machine: Ma
     parts = EvenParts(load) if isinstance(load, Workload) else load
     if setting.topology == FRAME_PARALLEL:
         return _whole_pictures(costs, parts.whole, setting, machine)
-    layout = setting.layout()
-    steps = Steps(layout, parts, costs, machine, setting.threads).steps
-    one = Steps(layout, parts, costs, machine, 1).steps if setting.threads > 1 else steps
+    made = Steps(setting, parts, costs, machine, threads=setting.threads)
+    steps, layout = made.steps, made.layout
+    one = Steps(setting, parts, costs, machine).steps if setting.threads > 1 else steps
     n_frames = parts.whole.n_frames
     work = [step.seconds(n_frames, waiting=False) for step in steps]
     waiting = [step.seconds(n_frames, working=False) for step in steps]

@@ -87,8 +87,8 @@ def on_paper(costs: Costs, parts: Parts, setting: Setting, machine: Machine) -> 
         step = picture_step(costs, parts.whole, apart, 1, 1, ranks - 1)
         frame_s = float(step.seconds(1)[0])
         return OnPaper(setting, ranks / frame_s, frame_s, ("rank 0", largest_part([step])))
-    layout = setting.layout()
-    steps = Steps(layout, parts, costs, apart, 1, named=False).steps
+    made = Steps(setting, parts, costs, apart, named=False)
+    steps, layout = made.steps, made.layout
     busy: dict[str, float] = {}
     for step in steps:
         busy[step.on] = busy.get(step.on, 0.0) + float(step.seconds(1)[0])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ...shared.config import PipelineSection, RunConfig
+from ..compositing.choose import RADIX
 from ..launch import mpi_available
 from ..layout import Layout
 from ..topologies import layout_of, ranks_to_start
@@ -16,8 +17,7 @@ class Setting:
     """How a run is laid out.
 
     threads : of each render rank.
-    ranks, culling_ranks, sampling_ranks, render_ranks, render_split : as of the configuration's ``pipeline``; ranks 0:
-        as many as the topology takes at least.
+    ranks and what follows : as of the configuration's ``pipeline``; ranks 0: as many as the topology takes at least.
     """
 
     topology: str
@@ -28,6 +28,8 @@ class Setting:
     sampling_ranks: int = 0
     render_ranks: int = 0
     render_split: str = "tiles"
+    compositing: str = "auto"
+    radix: int = RADIX
 
     @property
     def size(self) -> int:
@@ -59,4 +61,6 @@ class Setting:
             pipeline.sampling_ranks,
             pipeline.render_ranks,
             pipeline.render_split,
+            pipeline.compositing,
+            pipeline.radix,
         )

@@ -15,10 +15,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..layout import Lane, Layout
+from ...shared.framebuffer_runs import RUN, WORD
+from ..compositing.choose import COVERAGE, RATES
+from ..compositing.model import cheapest, compositing_cost
+from ..layout import Lane
 from .costs import Costs, stage_columns
 from .machine import Machine
 from .parts import Kind, Part, Parts
+from .setting import Setting
 from .workload import Workload
 
 INEQUALITIES = {
@@ -100,10 +104,11 @@ class Steps:
     """
 
     def __init__(
-        self, layout: Layout, parts: Parts, costs: Costs, machine: Machine, threads: int, *, named: bool = True
+        self, setting: Setting, parts: Parts, costs: Costs, machine: Machine, *, threads: int = 1, named: bool = True
     ) -> None:
+        self.layout = layout = setting.layout()
+        self._compositing, self._radix = setting.compositing, setting.radix
         self.steps: list[Step] = []
-        self._layout = layout
         self._parts = parts
         self._costs = costs
         self._machine = machine
@@ -126,15 +131,15 @@ class Steps:
         start = self._new(0, ())
         step = self.steps[start]
         step.add("work", self._costs.loop_s / self._machine.speed)
-        notes = self._others + (self._layout.display != 0)
+        notes = self._others + (self.layout.display != 0)
         step.add("messages", self._message_s * notes)
         return start
 
     def _lane(self, number: int, lane: Lane, start: int) -> list[int]:
         """Culling, sampling and render of one lane; the steps of its render ranks."""
         k, m, n = len(lane.culling), len(lane.sampling), len(lane.render)
-        split: Kind = "shares" if self._layout.split == "shares" else "tiles"
-        if len(self._layout.lanes) > 1:
+        split: Kind = "shares" if self.layout.split == "shares" else "tiles"
+        if len(self.layout.lanes) > 1:
             mine = self._of_lanes[number]
             culled, sampled, drawn = [mine], [mine], [mine]
         else:
@@ -148,7 +153,7 @@ class Steps:
         sampling = self._stages(
             "sampling", lane.sampling, sampled, self._with_camera(arrived, lane.sampling, lane.culling)
         )
-        if n > 1 and len(self._layout.lanes) == 1:
+        if n > 1 and len(self.layout.lanes) == 1:
             self._dealt(sampling, sampled, n)
         of_m = [of.load.render_points_bytes for of in sampled]
         of_n = [of.load.render_points_bytes for of in drawn]
@@ -161,8 +166,8 @@ class Steps:
         """What is sampled is looked through again for each of n tiles; for shares it is cut up, which costs little."""
         for step, part in zip(steps, parts, strict=True):
             seconds = self._costs.stages["sampling"].seconds
-            again = n * seconds["cell"] * part.load.cells if self._layout.split == "tiles" else 0.0
-            entries = seconds["entry"] * part.load.entries * (n if self._layout.split == "shares" else 1)
+            again = n * seconds["cell"] * part.load.cells if self.layout.split == "tiles" else 0.0
+            entries = seconds["entry"] * part.load.entries * (n if self.layout.split == "shares" else 1)
             self.steps[step].add("work", (again + entries) / self._machine.speed)
 
     def _with_camera(self, arrived: list[_Arrival], ranks: Sequence[int], earlier: Sequence[int]) -> list[_Arrival]:
@@ -235,24 +240,82 @@ class Steps:
         return arrived
 
     def _display(self, drawn: Sequence[int]) -> None:
-        """Framebuffers to the display rank, which takes their minimum; and the note that the frame is done."""
-        layout, costs, speed = self._layout, self._costs, self._machine.speed
-        last, display = drawn[0], layout.display
-        if len(drawn) > 1:
-            pieces = self._parts.of("shares" if layout.split == "shares" else "tiles", len(drawn))
-            before = [drawn[0]]
-            for rank, step, piece in zip(layout.render[1:], drawn[1:], pieces[1:], strict=True):
-                encoded_s = costs.encode_pixel_s * piece.pixels + costs.encode_word_s * piece.filled
-                self.steps[step].add("read back", encoded_s / speed)
-                sent = [piece.filled_bytes]
-                before += self._send([rank], [step], sent, [display], [range(1)], sent)[0].after
-            last = self._new(display, (self._joined(before),))
-            self.steps[last].threads = 1
-            filled = _sum([piece.filled for piece in pieces[1:]])
-            self.steps[last].add("read back", costs.merge_word_s * filled / speed)
-            self.steps[last].add("messages", self._message_s * (len(drawn) - 1))
+        """Framebuffers to the display rank, which makes them one; and the note that the frame is done."""
+        layout, display = self.layout, self.layout.display
+        last, n = drawn[0], len(drawn)
+        if n > 1:
+            shares = layout.split == "shares"
+            pieces = self._parts.of("shares" if shares else "tiles", n)
+            policy = self._policy(n, pieces[0].pixels) if shares else "direct"
+            last = self._direct(drawn, pieces) if policy == "direct" else self._in_rounds(policy, drawn, pieces)
         if display:
             self.steps[last].add("messages", self._message_s)
+
+    def _policy(self, n: int, pixels: float) -> str:
+        """How shares are composited: as configured, or as the program chooses."""
+        if self._compositing != "auto":
+            return self._compositing
+        return cheapest(n, int(pixels), COVERAGE, RATES, self._radix)
+
+    def _direct(self, drawn: Sequence[int], pieces: Sequence[Part]) -> int:
+        """Every render rank sends what it has to the display rank, which takes one after the other."""
+        costs, speed, render = self._costs, self._machine.speed, self.layout.render
+        before = [drawn[0]]
+        for rank, step, piece in zip(render[1:], drawn[1:], pieces[1:], strict=True):
+            encoded_s = costs.encode_pixel_s * piece.pixels + costs.encode_word_s * piece.filled
+            self.steps[step].add("read back", encoded_s / speed)
+            sent = [piece.filled_bytes]
+            before += self._send([rank], [step], sent, [render[0]], [range(1)], sent)[0].after
+        merged = costs.merge_word_s * _sum([piece.filled for piece in pieces[1:]])
+        return self._shown(before, merged, len(drawn) - 1)
+
+    def _in_rounds(self, policy: str, drawn: Sequence[int], pieces: Sequence[Part]) -> int:
+        """Exchanges between the render ranks, of which each then has a part of the picture; the display rank gathers.
+
+        Bytes and messages are those of the compositing model at the mean coverage; what is received is merged.
+        """
+        costs, machine, n = self._costs, self._machine, len(drawn)
+        pixels, filled = pieces[0].pixels, _sum([piece.filled for piece in pieces]) / n
+        coverage = float(np.mean(filled)) / pixels
+        run_px = RUN.itemsize * float(np.mean(filled)) / max(self._run_bytes(pieces), 1.0)
+        of = {
+            gather: compositing_cost(
+                policy, n, int(pixels), coverage, RATES, radix=self._radix, run_px=run_px or 1.0, gather=gather
+            )
+            for gather in (False, True)
+        }
+        each = of[False]
+        words = each.rank_bytes / WORD.itemsize
+        work_s = costs.encode_pixel_s * pixels + (costs.encode_word_s + costs.merge_word_s) * words
+        ready = self._joined(drawn)
+        before = []
+        for rank in self.layout.render:
+            step = self._new(rank, (ready,))
+            self.steps[step].threads = 1
+            self.steps[step].add("read back", work_s / machine.speed)
+            self.steps[step].add("messages", self._message_s * 2 * each.rank_messages)
+            before.append(step)
+            if machine.hosts > 1:
+                host = machine.host_of(rank)
+                before += [self._link(way, host, (ready,), each.rank_bytes) for way in ("out of", "into")]
+        gathered = of[True].all_bytes - each.all_bytes
+        if machine.hosts > 1 and gathered:
+            before.append(self._link("into", machine.host_of(self.layout.display), (self._joined(before),), gathered))
+        merged_s = costs.merge_word_s * gathered / WORD.itemsize
+        return self._shown(before, merged_s, n - 1 if gathered else 0)
+
+    def _run_bytes(self, pieces: Sequence[Part]) -> float:
+        """Mean bytes of a framebuffer that say where its words are."""
+        filled, sent = (_sum(values) for values in ([p.filled for p in pieces], [p.filled_bytes for p in pieces]))
+        return float(np.mean(sent - WORD.itemsize * filled)) / len(pieces)
+
+    def _shown(self, before: Sequence[int], merged_s: Seconds | float, messages: int) -> int:
+        """The display rank makes the picture of what it receives."""
+        step = self._new(self.layout.display, (self._joined(before),))
+        self.steps[step].threads = 1
+        self.steps[step].add("read back", merged_s / self._machine.speed)
+        self.steps[step].add("messages", self._message_s * messages)
+        return step
 
     def _new(self, rank: int, after: tuple[int, ...]) -> int:
         self.steps.append(Step(self._roles[rank], rank, after))
