@@ -301,7 +301,9 @@ def predict(
     sets: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a key.")] = None,
     what_if: Annotated[
         list[str] | None,
-        typer.Option(metavar="KEY=VALUE", help="A key of the run, or cores, bandwidth, latency, speed, points."),
+        typer.Option(
+            metavar="KEY=VALUE", help="A key of the run, or cores, hosts, bandwidth, link, latency, speed, points."
+        ),
     ] = None,
     ranks: Annotated[int, typer.Option(help="On paper, up to this many ranks.", min=3, max=1 << 16)] = 4096,
     repeats: Annotated[int, typer.Option(help="Runs of each calibration setting.", min=1)] = 3,
