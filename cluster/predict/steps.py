@@ -126,16 +126,20 @@ class Steps:
         self._of_lanes = parts.of(split, lanes) if lanes > 1 else []
         self._display([step for number, lane in enumerate(layout.lanes) for step in self._lane(number, lane, start)])
 
-    def _start(self) -> int:
-        """The coordinator: a camera to every other rank, and what comes outside the stages."""
-        start = self._new(0, ())
-        step = self.steps[start]
-        step.add("work", self._costs.loop_s / self._machine.speed)
-        notes = self._others + (self.layout.display != 0)
-        step.add("messages", self._message_s * notes)
-        return start
+    def _start(self) -> tuple[int, int]:
+        """After what rank 0 begins a frame, and after what the others do.
 
-    def _lane(self, number: int, lane: Lane, start: int) -> list[int]:
+        A frame starts when few enough are unfinished, whatever rank 0 is at: it has told the others ahead. Telling them
+        takes its time all the same, as does what comes outside the stages.
+        """
+        self.steps.append(Step("start", None, ()))
+        self.steps.append(Step("told", None, (0,), link_s=self._message_s * self._others))
+        own = self._new(0, (0,))
+        self.steps[own].add("work", self._costs.loop_s / self._machine.speed)
+        self.steps[own].add("messages", self._message_s * (self._others + (self.layout.display != 0)))
+        return own, 1
+
+    def _lane(self, number: int, lane: Lane, start: tuple[int, int]) -> list[int]:
         """Culling, sampling and render of one lane; the steps of its render ranks."""
         k, m, n = len(lane.culling), len(lane.sampling), len(lane.render)
         split: Kind = "shares" if self.layout.split == "shares" else "tiles"
@@ -145,7 +149,7 @@ class Steps:
         else:
             culled, sampled = self._parts.of("subtrees", k), self._parts.of("subtrees", m)
             drawn = self._parts.of(split, n)
-        begin = [_Arrival((start,), int(rank != 0)) for rank in lane.culling]
+        begin = [_Arrival((start[rank != 0],), int(rank != 0)) for rank in lane.culling]
         culling = self._stages("culling", lane.culling, culled, begin)
         pairs = [range(k)] * m
         bits = [of.load.visibility_bytes for of in culled]
