@@ -117,9 +117,8 @@ def validate_command(
         console.print(f"wrote {path}")
     if json_path is not None:
         rows = [_plain(str(c.point), c.predicted) | _compared(c) for c in comparisons]
-        write_json(
-            json_path, {"comparisons": rows, "median_error": median, "worst_error": worst, "machine": asdict(machine)}
-        )
+        found = {"comparisons": rows, "median_error": median, "worst_error": worst}
+        write_json(json_path, found | {"costs": asdict(costs), "machine": asdict(machine)})
 
 
 def _machine(ranks: int, links: bool) -> Machine:
