@@ -19,6 +19,9 @@ from ..shared.windows import Window
 
 Split = Literal["none", "tiles", "shares"]
 
+FEW_RENDERS = 8
+"""Render ranks of which any two may exchange framebuffers while it is cheap to measure all links between them."""
+
 
 @dataclass(frozen=True)
 class Lane:
@@ -57,6 +60,19 @@ class Layout:
     def workers(self) -> tuple[int, ...]:
         """Ranks with a stage, ascending."""
         return tuple(sorted({r for lane in self.lanes for r in (*lane.culling, *lane.sampling, *lane.render)}))
+
+    @property
+    def pairs(self) -> list[tuple[int, int]]:
+        """Ranks that send each other bits, entries or framebuffers, the lower first, ascending.
+
+        Of many render ranks that composite, only those with the display: which others talk is up to the policy.
+        """
+        apart = [lane for lane in self.lanes if lane.culling != lane.sampling]  # else each has its own part's bits
+        found = {(a, b) for lane in apart for a in lane.culling for b in lane.sampling}
+        found |= {(a, b) for lane in self.lanes for a in lane.sampling for b in lane.render}
+        meeting = self.render if self.split == "shares" and len(self.render) <= FEW_RENDERS else (self.display,)
+        found |= {(a, b) for a in meeting for b in self.render}
+        return sorted({(min(pair), max(pair)) for pair in found if pair[0] != pair[1]})
 
     def lane_of(self, rank: int) -> int | None:
         """Number of the lane that a rank is in; None for one without work."""

@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -34,15 +34,20 @@ from ..shared.messages import (
     decode_visibility,
 )
 from ..shared.scene_share import SceneShare
+from .balance import can_balance, is_on
 from .compositing import make_compositor
 from .compositing.tiles import Tiles
 from .delivery import receive_scene, serve_scene
 from .job import Job, RenderStage
 from .layout import ALONE, Layout, Plan
 from .record import FrameCounts, StageClock, rank_record, spread_ms, summed_traffic
-from .selection import CullingPart, LaneCells, SamplingPart, first_plan, merged_entries, shares_of
+from .selection import CullingPart, LaneCells, SamplingPart, first_plan, merged_entries, shares_of, with_borders
 from .transport import Transport
-from .wall import writes_screens
+from .wall import screen_windows, writes_screens
+
+if TYPE_CHECKING:
+    from .balance.balancer import Balancer
+    from .balance.times import StageTimes, TimesTeller
 
 STAGES = ("culling", "sampling", "render", "compositing", "picture")
 CULLING, SAMPLING, RENDER = range(3)
@@ -92,12 +97,21 @@ def run_single(job: Job, progress: Progress) -> dict[str, Any]:
 
 def run_layout(job: Job, layout: Layout, transport: Transport, progress: Progress) -> dict[str, Any] | None:
     """Do this rank's part of a layout; the statistics of the run on rank 0, None elsewhere. Collective."""
-    drawn = FrameLoop(job, layout, transport, progress).run()
+    loop = FrameLoop(job, layout, transport, progress)
+    drawn = loop.run()
     told = _told(layout, drawn, transport)
+    screens = bool(screen_windows(job, layout))
+    if can_balance(layout, screens):
+        told |= {"taken_s": loop.taken_s(), "adopting_s": loop.adopting_s}
     result = None
     if transport.rank == 0:
         others = [rank for rank in layout.workers if rank]
-        result = _merged(drawn, [told, *(transport.receive_note(rank, Kind.STATISTICS)[1] for rank in others)])
+        all_told = [told, *(transport.receive_note(rank, Kind.STATISTICS)[1] for rank in others)]
+        result = _merged(drawn, all_told)
+        if can_balance(layout, screens) and len(job.frames):
+            from .balance.summary import balance_record
+
+            result["balance"] = balance_record(layout, all_told, loop.balancer, screens)
     elif transport.rank in layout.workers:
         transport.send_note(0, Kind.STATISTICS, len(job.frames), told)
     transport.finish()
@@ -138,6 +152,12 @@ class FrameLoop:
         self._counts = FrameCounts()
         self._handed: dict[tuple[Kind, int], deque[Any]] = {}  # from a stage of this rank to the next
         self._held: dict[str, Any] = {}
+        self._plan = Plan(-1, (), (), ())
+        self._culling: CullingPart | None = None
+        self._sampling: SamplingPart | None = None
+        self.adopting_s: list[float] = []
+        self._balances = is_on(job.config.pipeline, layout, bool(screen_windows(job, layout)))
+        self.balancer: Balancer | None = None
 
     def run(self) -> Drawn:
         """Load what this rank's stages need, and do its part of every frame of the job."""
@@ -149,11 +169,15 @@ class FrameLoop:
             self._warm_up_selection()
             self._progress("loading the scene", 0)
             self._ready()
+            tell = self._open_balance() if self._balances else None
             started = time.perf_counter()
-            frames = Coordinator(job, self._layout, self._transport, self._plan) if self._rank == 0 else None
+            frames = None
+            if self._rank == 0:
+                frames = Coordinator(job, self._layout, self._transport, self._plan, self.balancer)
             for i in range(len(job.frames) if self._lane is not None else 0):
                 with self._waits_in.waiting():
                     start = frames.start(i, self._progress) if frames else self._receive_start()
+                self._follow(start.plan, frames)
                 self._select(start.camera)
                 if self._renders and render:
                     self._draw(render, start.camera)
@@ -162,9 +186,13 @@ class FrameLoop:
                     self._progress("rendering", i + 1)
                 elif self._shows and self._transport:
                     self._transport.send_note(0, Kind.FRAME_DONE, start.frame)
+                if tell:
+                    tell.done(i)
             if frames:
                 frames.finish(self._progress)
             drawn = time.perf_counter()
+            if self.balancer:
+                self.balancer.finish()
         return Drawn(
             [clock for clock in self._clocks.values() if clock.work_s],
             self._counts,
@@ -204,10 +232,16 @@ class FrameLoop:
 
     def _adopt(self, plan: Plan) -> None:
         """Make this rank's parts what a plan says."""
-        self._plan, lane = plan, self._lane
-        self._culling = self._sampling = None
-        if lane is None or not (self._culls or self._samples):
-            return
+        begun = time.perf_counter()
+        held, self._plan = self._plan, plan
+        if self._lane is not None and (self._culls or self._samples):
+            if (held.culling, held.sampling) != (plan.culling, plan.sampling):
+                self._make_parts(self._lane, plan)
+            for part in filter(None, (self._culling, self._sampling)):
+                part.look_through(self._layout, self._lane, plan)
+        self.adopting_s.append(time.perf_counter() - begun)
+
+    def _make_parts(self, lane: int, plan: Plan) -> None:
         ranks, cells = self._layout.lanes[lane], self._lanes[lane]
         if self._culls:
             part = ranks.culling.index(self._rank)
@@ -215,6 +249,41 @@ class FrameLoop:
         if self._samples:
             part = ranks.sampling.index(self._rank)
             self._sampling = SamplingPart(self._job, self._layout, lane, cells, plan, part, self._shares)
+
+    def _open_balance(self) -> TimesTeller:
+        """Begin to tell rank 0 of stage times; on rank 0, to hear of them."""
+        from .balance.balancer import Balancer, make_policies, receive_cells, send_cells
+        from .balance.times import TimesTeller
+
+        transport, layout = self._transport, self._layout
+        assert transport
+        cells = [lane.dealt for lane in self._lanes]
+        by_processor = self._job.rasterizer == "cpu"
+        rank_0_selects = layout.lanes[0].stages_of(0) != ["render"]
+        if self._rank == 0:
+            if not rank_0_selects:
+                cells = receive_cells(layout, transport)
+                self._plan = with_borders(self._plan, layout, cells)
+            views, screens = self._job.views, bool(screen_windows(self._job, layout))
+            policies = make_policies(layout, cells, views.width, views.height, screens)
+            self.balancer = Balancer(layout, transport, policies, self._job.frames)
+            return TimesTeller(self._clocks, by_processor, self.adopting_s, self.balancer.hear)
+        if not rank_0_selects and self._rank == layout.lanes[0].culling[0]:
+            send_cells(cells, transport)
+
+        def tell(times: StageTimes) -> None:
+            transport.send_note(0, Kind.STAGE_TIMES, times.first, times.to_note())
+
+        return TimesTeller(self._clocks, by_processor, self.adopting_s, tell)
+
+    def taken_s(self) -> dict[str, list[float]]:
+        """By stage, seconds of each frame as load is balanced by."""
+        from .balance import BUSY_STAGES
+        from .balance.times import taken
+
+        by_processor = self._job.rasterizer == "cpu"
+        clocks = (self._clocks[stage] for stage in BUSY_STAGES)
+        return {clock.stage: taken(clock, by_processor).tolist() for clock in clocks if clock.work_s}
 
     def _open_render(self, stack: ExitStack) -> RenderStage | None:
         """The render stage of this rank, on its share of the points; None for a rank that draws nothing."""
@@ -263,10 +332,17 @@ class FrameLoop:
 
     def _receive_start(self) -> FrameStart:
         assert self._transport
-        start = decode_frame_start(*self._transport.receive(0, Kind.FRAME_START, FRAME_START_BYTES))
-        while self._plan.number < start.plan:
-            self._adopt(Plan.from_note(self._transport.receive_note(0, Kind.PLAN)[1]))
-        return start
+        return decode_frame_start(*self._transport.receive(0, Kind.FRAME_START, FRAME_START_BYTES))
+
+    def _follow(self, number: int, frames: Coordinator | None) -> None:
+        """Adopt plans until the one of a number holds. Rank 0 may have started frames by later ones."""
+        while self._plan.number < number:
+            if frames:
+                plan = frames.plans.pop(self._plan.number + 1)
+            else:
+                assert self._transport
+                plan = Plan.from_note(self._transport.receive_note(0, Kind.PLAN)[1])
+            self._adopt(plan)
 
     def _select(self, camera: Camera) -> None:
         """Do this rank's part of culling and sampling, and hand it to whoever samples and renders it."""
@@ -277,15 +353,16 @@ class FrameLoop:
             with self._clocks["culling"].working():
                 bits = self._culling.process(camera)
                 of_layers = [node.process(camera) for node in self._layer_culling]
-            for rank, message in zip(lane.sampling, bits, strict=True):
-                self._hand(rank, Kind.VISIBILITY, message)
+            for part, message in zip(self._culling.receivers, bits, strict=True):
+                self._hand(lane.sampling[part], Kind.VISIBILITY, message)
             for message in of_layers:
                 self._hand(first.sampling[0], Kind.VISIBILITY, message)
             self._counts.add(self._culling.whole)
         if self._sampling:
             with self._clocks["sampling"].waiting():
                 received = [
-                    self._take_bits(rank, n) for rank, n in zip(lane.culling, self._sampling.n_cells, strict=True)
+                    self._take_bits(lane.culling[part], n)
+                    for part, n in zip(self._sampling.senders, self._sampling.n_cells, strict=True)
                 ]
                 bits_of_layers = [
                     self._take_bits(first.culling[0], len(layer.octree))
@@ -359,10 +436,17 @@ class FrameLoop:
 
 
 class Coordinator:
-    """Starts frames on the other ranks, few enough at a time, and hears when they are done. On rank 0."""
+    """Starts frames on the other ranks, few enough at a time, and hears when they are done. On rank 0.
 
-    def __init__(self, job: Job, layout: Layout, transport: Transport | None, plan: Plan) -> None:
-        self._job, self._transport, self._plan = job, transport, plan
+    balancer : has the plan of each frame; None: the first one holds.
+    plans : by number, those that frames were started by and that this rank has not adopted yet.
+    """
+
+    def __init__(
+        self, job: Job, layout: Layout, transport: Transport | None, plan: Plan, balancer: Balancer | None = None
+    ) -> None:
+        self._job, self._transport, self._plan, self._balancer = job, transport, plan, balancer
+        self.plans: dict[int, Plan] = {}
         self._others = [rank for rank in layout.workers if rank]
         self._display = layout.display
         self._ahead = job.frames_in_flight if self._others else 1
@@ -390,12 +474,22 @@ class Coordinator:
     def _issue(self) -> None:
         frames = self._job.frames
         while len(self._starts) < min(len(frames), len(self.latency_s) + self._ahead):
+            if self._balancer:
+                self._change_to(self._balancer.plan_for(len(self._starts), self._plan))
             start = FrameStart(self._job.camera(frames[len(self._starts)]), self._plan.number)
             for rank in self._others:
                 assert self._transport
                 self._transport.send(rank, start)
             self._starts.append(start)
             self._issued_s.append(time.perf_counter())
+
+    def _change_to(self, plan: Plan) -> None:
+        if plan is self._plan:
+            return
+        self._plan = self.plans[plan.number] = plan
+        for rank in self._others:
+            assert self._transport
+            self._transport.send_note(rank, Kind.PLAN, 0, plan.to_note())
 
     def _has_done(self) -> bool:
         return bool(self._display and self._transport and self._transport.has_note(self._display, Kind.FRAME_DONE))

@@ -21,18 +21,22 @@ RECORD_VERSION = 1
 
 
 class StageClock:
-    """Times of one stage, frame by frame: seconds of work and seconds of waiting for messages or room."""
+    """Times of one stage, frame by frame: seconds of work, of the processor in it, and of waiting for messages
+    or room.
+    """
 
     def __init__(self, stage: str) -> None:
         self.stage = stage
         self.work_s: list[float] = []
+        self.cpu_s: list[float] = []
         self.wait_s: list[float] = []
 
     @contextmanager
     def working(self) -> Iterator[None]:
         """Around one frame's work."""
-        start = time.perf_counter()
+        start, cpu = time.perf_counter(), time.process_time()
         yield
+        self.cpu_s.append(time.process_time() - cpu)
         self.work_s.append(time.perf_counter() - start)
 
     @contextmanager

@@ -114,6 +114,7 @@ def _attempt(
     config_path: Path, overrides: list[str], json_path: Path | None, transport: Transport, survival: Survival
 ) -> int:
     """Do this rank's part. What is wrong with the input is said once, by the first rank that finds something."""
+    from .compression import add_links, start_coding
     from .pipeline import RENDER, receive_job
 
     config: RunConfig | None = None
@@ -148,6 +149,7 @@ def _attempt(
     pictures = transport.join(job.pictures if job and transport.rank == 0 else []).astype(int).tolist()
     begun_with = survival.pictures = pictures if survival.pictures is None else survival.pictures
     try:
+        transport.coding = start_coding(transport, config.pipeline)
         if job is None:
             job = receive_job(config, transport)
             make_output(job.output)  # on a host of its own there may be no such folder yet
@@ -159,7 +161,7 @@ def _attempt(
                     record(doing=doing, done=done)
                     progress.show(doing, done)
 
-            result = _run_topology(job, transport, show)
+            result = add_links(transport, _run_topology(job, transport, show))
         if result is not None:
             decision = _decided(config.pipeline, transport.size, survival.lost)
             result |= {"mpi": transport.library, "lost": survival.lost} | drawn_by(job, begun_with)

@@ -8,6 +8,7 @@ and a sampling part have in common, in stored order; both ends derive these from
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from itertools import pairwise
 
@@ -47,13 +48,25 @@ class LaneCells:
 
     def borders(self, n: int) -> tuple[int, ...]:
         """Borders of n parts of evenly many cells."""
-        if n == 1:
-            return (0, 1)
-        return tuple(balanced_borders(self.subtrees.cells, n).tolist())
+        return even_borders(self.dealt, n)
 
     def part(self, borders: Sequence[int], i: int) -> tuple[np.ndarray, Octree, np.ndarray | None]:
         """(cells, octree, own) of the i-th part, as of ``Subtrees.part``; one part is the lane's octree itself."""
         return self._whole if len(borders) == 2 else self.subtrees.part(*borders[i : i + 2])
+
+    def cells_of(self, borders: Sequence[int], i: int) -> np.ndarray:
+        """The cells of the i-th part alone."""
+        return self._whole[0] if len(borders) == 2 else self.subtrees.cells_of(*borders[i : i + 2])
+
+    @property
+    def dealt(self) -> np.ndarray:
+        """(s,) number of cells of each subtree; where there is one rank a stage, one number."""
+        return self.subtrees.cells if max(self.parts) > 1 else np.array([len(self.octree)])
+
+
+def even_borders(cells: np.ndarray, n: int) -> tuple[int, ...]:
+    """Borders of n parts of evenly many cells. cells : (s,) of each subtree."""
+    return (0, 1) if n == 1 else tuple(balanced_borders(cells, n).tolist())
 
 
 def shares_of(layout: Layout, whole: Octree) -> list[tuple[int, int]]:
@@ -62,6 +75,16 @@ def shares_of(layout: Layout, whole: Octree) -> list[tuple[int, int]]:
         return []
     borders = share_borders(whole, len(layout.render)).tolist()
     return list(pairwise(borders))
+
+
+def with_borders(plan: Plan, layout: Layout, cells: Sequence[np.ndarray]) -> Plan:
+    """A first plan with the borders that a rank without octree could not know. cells : as of ``dealt``, by lane."""
+    parts = zip(layout.lanes, cells, strict=True)
+    culling, sampling = zip(
+        *((even_borders(of, len(lane.culling)), even_borders(of, len(lane.sampling))) for lane, of in parts),
+        strict=True,
+    )
+    return replace(plan, culling=culling, sampling=sampling)
 
 
 def first_plan(job: Job, layout: Layout, lanes: Sequence[LaneCells]) -> Plan:
@@ -82,22 +105,25 @@ def first_plan(job: Job, layout: Layout, lanes: Sequence[LaneCells]) -> Plan:
 
 
 class CullingPart:
-    """A culling rank's part of a lane, under one plan.
+    """A culling rank's part of a lane, under plans of the same borders of subtrees, without a window at first.
 
+    receivers : numbers of the sampling parts that have subtrees of this one.
     whole : bits of all its cells, of the frame processed last.
     """
 
     def __init__(self, job: Job, layout: Layout, lane: int, cells: LaneCells, plan: Plan, i: int) -> None:
         mine, octree, _ = cells.part(plan.culling[lane], i)
         self._node: CullingNode = job.culling_node(octree)
+        self._window: Window | None = None
+        self.receivers = overlapping(plan.culling[lane], i, plan.sampling[lane])
+        self._common = [common_cells(mine, cells.cells_of(plan.sampling[lane], j)) for j in self.receivers]
+
+    def look_through(self, layout: Layout, lane: int, plan: Plan) -> None:
+        """Take the window of a plan that has the borders of this part."""
         self._window = lane_window(layout, lane, plan)
-        sampling = layout.lanes[lane].sampling
-        self._common: list[np.ndarray | None] = [
-            common_cells(mine, cells.part(plan.sampling[lane], j)[0]) for j in range(len(sampling))
-        ]
 
     def process(self, camera: Camera) -> list[VisibilityBits]:
-        """The bits of a frame, for each sampling part of the lane."""
+        """The bits of a frame, for each of the ``receivers``."""
         self.whole = bits = self._node.process(camera, self._window)
         if all(common is None for common in self._common):
             return [bits] * len(self._common)
@@ -108,9 +134,9 @@ class CullingPart:
 
 
 class SamplingPart:
-    """A sampling rank's part of a lane, under one plan.
+    """A sampling rank's part of a lane, under plans of the same borders of subtrees, without windows at first.
 
-    n_cells : of the bits that come from each culling part.
+    senders : numbers of the culling parts that have subtrees of this one.  n_cells : of the bits that each sends.
     """
 
     def __init__(
@@ -125,16 +151,19 @@ class SamplingPart:
     ) -> None:
         mine, octree, own = cells.part(plan.sampling[lane], i)
         self._node: SamplingNode = job.sampling_node(octree, own)
-        culling = layout.lanes[lane].culling
-        self._common = [common_cells(mine, cells.part(plan.culling[lane], j)[0]) for j in range(len(culling))]
+        self.senders = overlapping(plan.sampling[lane], i, plan.culling[lane])
+        self._common = [common_cells(mine, cells.cells_of(plan.culling[lane], j)) for j in self.senders]
         self._n = len(octree)
         self.n_cells = [self._n if common is None else len(common) for common in self._common]
         renders = layout.renders_of(lane)
-        self._windows = (
-            [] if lane_window(layout, lane, plan) or not plan.windows else [plan.windows[j] for j in renders]
-        )
+        self._windows: list[Window] = []
         self._shares = [shares[j] for j in renders] if shares else []
         self._n_renders = len(renders)
+
+    def look_through(self, layout: Layout, lane: int, plan: Plan) -> None:
+        """Take the windows of a plan that has the borders of this part."""
+        split = plan.windows and not lane_window(layout, lane, plan)
+        self._windows = [plan.windows[j] for j in layout.renders_of(lane)] if split else []
 
     def process(self, camera: Camera, received: Sequence[VisibilityBits]) -> tuple[RenderPoints, list[RenderPoints]]:
         """(everything chosen of the lane's points; what each render rank of the lane draws of it)."""
@@ -154,6 +183,14 @@ class SamplingPart:
         for bits, common in zip(received, self._common, strict=True):
             visible[slice(None) if common is None else common] |= bits.unpack()
         return VisibilityBits.pack(frame, visible)
+
+
+def overlapping(mine: Sequence[int], i: int, theirs: Sequence[int]) -> list[int]:
+    """Numbers of the parts of other borders that have a subtree of the i-th part; of what is not dealt, the whole."""
+    n = len(theirs) - 1
+    if len(mine) == 2 or n == 1:
+        return list(range(n))
+    return [j for j in range(n) if max(mine[i], theirs[j]) < min(mine[i + 1], theirs[j + 1])]
 
 
 def common_cells(mine: np.ndarray, theirs: np.ndarray) -> np.ndarray | None:

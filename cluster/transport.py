@@ -9,17 +9,21 @@ from __future__ import annotations
 
 import json
 import os
+import threading
 import time
 import warnings
 from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from ..shared.errors import DeviceError, MessageError, SplatpipeError
-from ..shared.messages import HEADER, Kind, Message, encode, header, parse_header
+from ..shared.messages import HEADER, Kind, Message, encode, header, is_coded, parse_header
 from .launch import check_starter
+
+if TYPE_CHECKING:
+    from .compression import Coding
 
 PIECE_BYTES = 1 << 30
 _ULFM = "OMPI_MCA_mpi_ft_enable"
@@ -45,7 +49,10 @@ class Transport:
     depth : messages to one rank that may be under way before ``send`` waits (double-buffered: 2).
     timeout_s : longest wait in ``receive`` and ``send``; then SplatpipeError naming the rank waited for.
     patience_s : longest wait for ranks that may be loading: in collectives and patient receives.
+    coding : codes what is sent (``compression``); None: nothing is. What arrives says itself whether it is coded.
     """
+
+    coding: Coding | None = None
 
     def __init__(self, timeout_s: float = 300.0, depth: int = 2, piece_bytes: int = PIECE_BYTES) -> None:
         try:
@@ -65,6 +72,7 @@ class Transport:
         self._comm: Any = MPI.COMM_WORLD.Dup()
         self.rank: int = self._comm.Get_rank()
         self.size: int = self._comm.Get_size()
+        self._any_thread = MPI.Query_thread() >= MPI.THREAD_SERIALIZED
         self.timeout_s = timeout_s
         self.patience_s = 3600.0
         self._depth = depth
@@ -116,7 +124,10 @@ class Transport:
 
     def send(self, dest: int, message: Message) -> None:
         """Start sending a message, whose arrays must not change any more. Waits while ``depth`` are under way."""
-        self._post(dest, *encode(message))
+        head, payload = encode(message)
+        if self.coding is not None:
+            head, payload = self.coding.coded(dest, head, payload)
+        self._post(dest, head, payload)
 
     def send_note(self, dest: int, kind: Kind, frame: int, note: dict[str, Any] | None = None) -> None:
         """Start sending a small note as JSON: frame finished, statistics at the end."""
@@ -127,8 +138,8 @@ class Transport:
         """The next message of kind ``expected`` from a rank; polite while it waits.
 
         patient : wait for it for up to ``patience_s``, as for a rank that is loading a scene.
-        Raises MessageError for a foreign header or a payload above ``max_bytes`` (nothing is allocated for it),
-        SplatpipeError after ``timeout_s``.
+        Raises MessageError for a foreign header, a payload above ``max_bytes`` (nothing is allocated for it) or a coded
+        one that is damaged, SplatpipeError after ``timeout_s``.
         """
         head = bytearray(HEADER.size)
         request = self._comm.Irecv([head, self._mpi.BYTE], source, int(expected))
@@ -141,6 +152,10 @@ class Transport:
         payload = np.empty(length, np.uint8)
         requests = [self._comm.Irecv([piece, self._mpi.BYTE], source, int(expected)) for piece in self._pieces(payload)]
         self._wait(requests, source, expected.name, self.timeout_s)
+        if is_coded(head):
+            from ..shared.message_codecs import unpack
+
+            payload = unpack(kind, payload.data, max_bytes)
         return Received(frame, payload.data)
 
     def receive_note(self, source: int, expected: Kind) -> tuple[int, dict[str, Any]]:
@@ -158,6 +173,10 @@ class Transport:
         """Whether a message of a kind waits to be received. Cost: one probe."""
         return bool(self._comm.Iprobe(source, int(kind)))
 
+    def may_talk(self) -> bool:
+        """Whether the thread that asks may send and receive: any, one at a time, where MPI allows it."""
+        return self._any_thread or threading.current_thread() is threading.main_thread()
+
     def agree(self, status: int) -> list[int]:
         """The status, or another small number, of every rank. Collective."""
         statuses = np.empty(self.size, np.int32)
@@ -170,6 +189,20 @@ class Transport:
         joined = np.empty(sum(counts))
         self._poll([self._comm.Iallgatherv(np.ascontiguousarray(values, np.float64), [joined, counts])])
         return joined
+
+    def total(self, counts: np.ndarray) -> np.ndarray:
+        """Int64 sums over all ranks of an array that has the same shape on each. Collective."""
+        sums = np.empty_like(counts)
+        self._poll([self._comm.Iallreduce(np.ascontiguousarray(counts), sums)])
+        return sums
+
+    def gather(self, data: bytes) -> list[bytes]:
+        """The bytes that each rank gives, below 2 GiB together. Collective."""
+        lengths = self.agree(len(data))
+        joined = bytearray(sum(lengths))
+        self._poll([self._comm.Iallgatherv([data, self._mpi.BYTE], [joined, lengths, None, self._mpi.BYTE])])
+        ends = np.cumsum(lengths).tolist()
+        return [bytes(joined[end - n : end]) for end, n in zip(ends, lengths, strict=True)]
 
     def minimum_of(self, ranks: Sequence[int]) -> Callable[[np.ndarray], np.ndarray | None]:
         """What takes (n,) uint64 of each of these ranks to their minimum on the first of them, None elsewhere.
@@ -197,6 +230,14 @@ class Transport:
         here.Free()
         return n
 
+    def hosts(self) -> list[int]:
+        """Of every rank, the lowest rank on its host. Collective."""
+        here = self._comm.Split_type(self._mpi.COMM_TYPE_SHARED)
+        lowest = np.array([self.rank], np.int32)
+        here.Allreduce(self._mpi.IN_PLACE, lowest, self._mpi.MIN)
+        here.Free()
+        return self.agree(int(lowest[0]))
+
     def bounce(self, peer: int, payload: np.ndarray, *, serve: bool) -> None:
         """Send an (n,) uint8 payload to a rank and take it back, or the other way round, with MPI's own blocking calls.
 
@@ -209,13 +250,34 @@ class Transport:
         if not serve:
             self._comm.Send(buffer, peer)
 
+    def idle(self, dest: int) -> bool:
+        """Whether all that was sent to a rank has gone."""
+        queue = self._under_way[dest]
+        while queue and self._mpi.Request.Testall(queue[0][0]):
+            queue.popleft()
+        return not queue
+
     def traffic(self) -> dict[str, dict[str, int]]:
         """Messages and bytes (headers included) this rank has sent, by kind."""
         return {kind: {"count": self._count[kind], "bytes": n} for kind, n in self._bytes.items()}
 
-    def meet(self) -> None:
-        """Wait until every rank is here, for up to ``patience_s``: loading a scene takes its time. Collective."""
-        self._poll([self._comm.Ibarrier()])
+    def start_counting(self) -> None:
+        """Forget what ``traffic`` has counted so far."""
+        self._bytes.clear()
+        self._count.clear()
+
+    def meet(self, meanwhile: Callable[[], None] | None = None) -> None:
+        """Wait until every rank is here, for up to ``patience_s``: loading a scene takes its time. Collective.
+
+        meanwhile : called time and again while this rank waits, which then has no limit.
+        """
+        request = self._comm.Ibarrier()
+        if meanwhile is None:
+            self._poll([request])
+            return
+        while not request.Test():
+            meanwhile()
+            time.sleep(_SLEEP_S[1])
 
     def finish(self) -> None:
         """Wait until everything sent has gone and every rank is here. Collective."""
@@ -246,9 +308,8 @@ class Transport:
         return [body[i : i + self._piece_bytes] for i in range(0, len(body), self._piece_bytes)]
 
     def _drain(self, dest: int, at_most: int) -> None:
+        self.idle(dest)  # takes out what has gone
         queue = self._under_way[dest]
-        while queue and self._mpi.Request.Testall(queue[0][0]):
-            queue.popleft()
         while len(queue) > at_most:
             self._wait(queue[0][0], dest, "a message sent to it to be taken", self.timeout_s)
             queue.popleft()

@@ -24,6 +24,7 @@ wall, windows      screens of a display wall; tiles of a picture
 camera_path,       orbit, keyframes, explicit poses
 keyframes
 messages           what crosses from one rank to another
+message_codecs     the same in fewer bytes
 config             the TOML configuration of a run
 colour             attribute → colour word
 metrics            how far one picture is from another

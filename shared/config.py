@@ -157,12 +157,15 @@ class PipelineSection(Section):
     sampling_ranks: Ranks = 0
     render_ranks: Ranks = 0
     render_split: Literal["tiles", "shares"] = "tiles"
+    balance: Literal["off", "measured"] = "off"
     frames_in_flight: Annotated[int, Field(ge=1, le=64)] = 4
     compositing: Literal["auto", "direct", "direct-reduce", "binary-swap", "radix-k", "mpi-min"] = "auto"
     radix: Annotated[int, Field(ge=2, le=1024)] = 8
     timeout_s: Positive = 300.0
     loading_timeout_s: Positive = 3600.0
     survive: bool = True
+    compression: Literal["auto", "off", "on"] = "auto"
+    link_mb_per_s: Annotated[float, Field(ge=0, le=1e9)] = 0.0
 
 
 class OutputSection(Section):
@@ -204,10 +207,7 @@ def load_config(path: Path | str, overrides: list[str] | None = None) -> RunConf
     Raises ConfigError naming the file and key, what was found and what was expected; an unknown key is refused and
     the nearest known one suggested.
     """
-    data = read_config(path)
-    for override in overrides or []:
-        _apply(data, override)
-    return parse_config(data, source=str(path))
+    return parse_config(read_config(path), str(path), overrides)
 
 
 def read_config(path: Path | str) -> dict[str, Any]:
@@ -238,8 +238,10 @@ def read_toml(path: Path | str) -> dict[str, Any]:
         raise ConfigError(f"{path}: not valid TOML: {error}") from None
 
 
-def parse_config(data: dict[str, Any], source: str = "configuration") -> RunConfig:
-    """The validated configuration of nested tables. Raises ConfigError as ``load_config`` does."""
+def parse_config(data: dict[str, Any], source: str = "configuration", overrides: list[str] | None = None) -> RunConfig:
+    """The validated configuration of nested tables with overrides. Raises ConfigError as ``load_config`` does."""
+    for override in overrides or []:
+        _apply(data, override)
     return validated(RunConfig, data, source)
 
 

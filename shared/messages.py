@@ -14,6 +14,7 @@ message            from → to                     payload
 ``SceneBytes``     sampling → render             the bytes asked for, as they are stored
 ``Framebuffer``    render → render               words of pixels, by runs (``framebuffer_runs``); none: background
 ``FilmPicture``    render → rank 0               8-bit red, green, blue of each pixel
+``Build``          any → any                     JSON: how far a rank is with its part of a build, or that it failed
 =================  ============================  ============================================================
 
 Those of scenes cross before the first frame, where ``scene.delivery`` is ``messages``. Their header has the number of
@@ -23,7 +24,8 @@ Protocol versions
     1. The first.
     2. Scenes by messages.
     3. Framebuffers.
-    4. Frames start by a plan; pictures of films.
+    4. Frames start by a plan; notes of plans and of stage times; pictures of films; coded payloads
+       (``message_codecs``).
 """
 
 from __future__ import annotations
@@ -42,6 +44,8 @@ from .scene_info import MAX_INFO_BYTES, SceneInfo, info_from_json
 MAGIC = b"SPLT"
 PROTOCOL_VERSION = 4
 HEADER = struct.Struct("<4sHHQQ")
+CODED = 0x8000
+"""Bit of a header's kind that says that the payload is coded (``message_codecs``)."""
 _FRAME_START = struct.Struct("<16d3d2IdI")
 _SCENE_REQUEST = struct.Struct("<IIQ")
 _MAX_COLOUR_BYTES = 64
@@ -75,6 +79,8 @@ class Kind(IntEnum):
     FRAMEBUFFER = 9
     PLAN = 10
     FILM_PICTURE = 11
+    STAGE_TIMES = 12
+    BUILD = 32
 
 
 @dataclass(frozen=True)
@@ -189,9 +195,14 @@ Message = (
 )
 
 
-def header(kind: Kind, frame: int, length: int) -> bytes:
+def header(kind: Kind, frame: int, length: int, *, coded: bool = False) -> bytes:
     """The 24 bytes in front of a payload."""
-    return HEADER.pack(MAGIC, PROTOCOL_VERSION, kind, frame, length)
+    return HEADER.pack(MAGIC, PROTOCOL_VERSION, kind | CODED * coded, frame, length)
+
+
+def is_coded(head: bytes | bytearray | memoryview) -> bool:
+    """Whether the payload behind a header that ``parse_header`` has taken is coded."""
+    return bool(HEADER.unpack_from(head)[2] & CODED)
 
 
 def parse_header(data: bytes | memoryview) -> tuple[Kind, int, int]:
@@ -204,7 +215,7 @@ def parse_header(data: bytes | memoryview) -> tuple[Kind, int, int]:
     if version != PROTOCOL_VERSION:
         raise MessageError(f"message header: found protocol {version}, expected {PROTOCOL_VERSION}")
     try:
-        return Kind(kind), frame, length
+        return Kind(kind & ~CODED), frame, length
     except ValueError:
         raise MessageError(f"message header: found kind {kind}, expected one of {[int(k) for k in Kind]}") from None
 

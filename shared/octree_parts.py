@@ -111,11 +111,20 @@ class Subtrees:
         cells : (p,) int64, ascending, the part's cells: those of the subtrees and all above them.
         own : (p,) bool, those that this part and no other range of subtrees answers for.
         """
+        mine, keep = self._masks(first, stop)
+        cells = np.flatnonzero(keep)
+        return cells, part_of(self.octree, keep), mine[cells]
+
+    def cells_of(self, first: int, stop: int) -> np.ndarray:
+        """The cells of a part alone. Cost: two passes over the cells."""
+        return np.flatnonzero(self._masks(first, stop)[1])
+
+    def _masks(self, first: int, stop: int) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) bool each: the cells of a part's subtrees; and all above them too."""
         mine = (self.label >= first) & (self.label < stop)
         keep = _with_ancestors(self.octree, mine.copy())
         keep[0] = True
-        cells = np.flatnonzero(keep)
-        return cells, part_of(self.octree, keep), mine[cells]
+        return mine, keep
 
 
 def balanced_borders(weights: np.ndarray, n: int) -> np.ndarray:
