@@ -259,6 +259,14 @@ def model_rank(
     rank_command(config, sets or [], output, rasterizer, render_rank)
 
 
+@app.command("machine-rank", hidden=True)
+def machine_rank(output: Path) -> None:
+    """One rank's part of `splatpipe predict --links`, which starts it."""
+    from .predict.machine import machine_rank
+
+    machine_rank(output)
+
+
 @app.command()
 def error(
     config: Annotated[Path, typer.Argument(help="TOML file: base run, scenes, sweeps; configs/error has examples.")],
@@ -298,17 +306,25 @@ def predict(
     sets: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a key.")] = None,
     what_if: Annotated[
         list[str] | None,
-        typer.Option(metavar="KEY=VALUE", help="A key of the run, or cores, bandwidth, latency, speed, points."),
+        typer.Option(
+            metavar="KEY=VALUE", help="A key of the run, or cores, hosts, bandwidth, link, latency, speed, points."
+        ),
     ] = None,
     ranks: Annotated[int, typer.Option(help="On paper, up to this many ranks.", min=3, max=1 << 16)] = 4096,
     repeats: Annotated[int, typer.Option(help="Runs of each calibration setting.", min=1)] = 3,
-    output: Annotated[Path, typer.Option("--output", "-o", help="Calibration runs and report.")] = Path("predicted"),
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="Runs and report; default: predicted, or where the experiment says."),
+    ] = None,
     validate: Annotated[
         bool, typer.Option("--validate", help="Predicted beside measured, over an experiment.")
     ] = False,
     fresh: Annotated[bool, typer.Option("--fresh", help="Measure again instead of using what is there.")] = False,
     best: Annotated[
         bool, typer.Option("--best", help="Of each setting the fastest repeat: for a machine that others work on.")
+    ] = False,
+    links: Annotated[
+        bool, typer.Option("--links", help="Measure the link between the hosts that mpiexec uses, and predict with it.")
     ] = False,
     json: JsonOption = None,
 ) -> None:
@@ -318,12 +334,11 @@ def predict(
     """
     from .predict.command import predict_command, validate_command
 
+    settings = {"fresh": fresh, "best": best, "links": links, "json_path": json}
     if validate:
-        validate_command(config, fresh=fresh, best=best, json_path=json)
+        validate_command(config, output, **settings)
     else:
-        predict_command(
-            config, sets or [], what_if or [], ranks, repeats, output, fresh=fresh, best=best, json_path=json
-        )
+        predict_command(config, sets or [], what_if or [], ranks, repeats, output or Path("predicted"), **settings)
 
 
 @bench_app.command("raster")

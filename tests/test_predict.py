@@ -14,9 +14,12 @@ from splatpipe.cluster.measured import measured_run
 from splatpipe.cluster.predict.calibrate import calibration_points, extended, with_point
 from splatpipe.cluster.predict.command import predict_command, validate_command
 from splatpipe.cluster.predict.costs import Costs, Measured, StageCost, fit_costs, fit_stage, stage_columns
-from splatpipe.cluster.predict.forecast import Machine, Setting, fit_messages, forecast
-from splatpipe.cluster.predict.hybrid import best_split, scaling, split_costs
+from splatpipe.cluster.predict.forecast import fit_messages, forecast
+from splatpipe.cluster.predict.hybrid import best_split, split_costs
+from splatpipe.cluster.predict.machine import Machine
 from splatpipe.cluster.predict.recurrence import Stage, run_schedule
+from splatpipe.cluster.predict.scaling import TOPOLOGIES
+from splatpipe.cluster.predict.setting import Setting
 from splatpipe.cluster.predict.whatif import Case, changed
 from splatpipe.cluster.predict.workload import COLD_POINTS, Workload, count_workload, threads_of
 from splatpipe.shared.build import BuildSettings, build_scene
@@ -270,16 +273,17 @@ def test_bandwidth_latency_and_speed_work_as_they_should():
 # --- ranks on paper --------------------------------------------------------------------------------------------------
 
 
-def test_ranks_scale_until_messages_or_pixels_limit():
+def test_the_best_split_uses_the_ranks_that_pay():
     big = load_of(points=1e9)
-    found = scaling(TRUE, big, Machine(1), 4096)
-    splits = list(found.values())
-    rates = [split.frames_per_s for split in splits]
-    assert rates == sorted(rates)
-    assert list(found) == [2**i for i in range(2, 13)]
-    assert all(split.ranks <= ranks for ranks, split in found.items())
-    assert splits[0].limit == ("render", "(3) vertices")
-    assert splits[-1].limit[1] in ("(2) external latency", "(6) fragments", "(2) external bandwidth")
+    found = [best_split(TRUE, big, Machine(1), 2**i) for i in range(2, 13)]
+    rates = [split.frames_per_s for split in found]
+    assert rates[0] < rates[3] < max(rates)
+    assert found[0].limit == ("render", "(3) vertices")
+    assert max(found, key=lambda of: of.frames_per_s).limit[1] in (
+        "(2) external latency",
+        "(6) fragments",
+        "(2) external bandwidth",
+    )
     alone = split_costs(TRUE, big, Machine(1), 1, 1, 1)
     assert rates[-1] < 4096 * alone.frames_per_s
     small = best_split(TRUE, load_of(points=1e4), Machine(1), 4096)
@@ -367,7 +371,7 @@ def test_what_if_changes_one_thing(config):
     assert changed(case, str(config), [], "bandwidth=1e6").machine.bandwidth_bytes_per_s == 1e6
     for change, said in [
         ("cores", "expected key=value"),
-        ("core=3", "expected a key of the configuration or one of cores, bandwidth"),
+        ("core=3", "expected a key of the configuration or one of cores, hosts, bandwidth"),
         ("cores=-3", "expected a number > 0"),
         ("speed=fast", "expected a number > 0"),
         ("render.rasterizer=gl", "costs are of rasterizer cpu"),
@@ -402,7 +406,9 @@ def test_the_command_predicts_what_it_was_not_shown(config, tmp_path):
     truth = fake_run(config, ["pipeline.topology=single", "render.threads=1"])["frames_per_s"]
     assert cases["single, 1 threads"] == pytest.approx(truth, rel=0.02)
     assert cases["points=1e9"] < cases["as configured"]
-    assert [split["ranks"] for split in results["ranks"]] == [4, 8, 16, 32, 64, 128, 256] * 3
+    of_hybrid = [found["ranks"] for found in results["ranks"] if found["topology"] == "hybrid"]
+    assert of_hybrid == [4, 16, 64, 256] * 3
+    assert {found["topology"] for found in results["ranks"]} == set(TOPOLOGIES)
     assert results["ranks"][-1]["inequality"].startswith("(")
     report = (tmp_path / "out" / "report.md").read_text()
     assert "residual" in report

@@ -53,14 +53,16 @@ class Experiment:
         return hashlib.sha256(json.dumps([runs, scenes], sort_keys=True).encode()).hexdigest()
 
 
-def load_experiment(file: Path) -> Experiment:
+def load_experiment(file: Path, output: Path | None = None) -> Experiment:
     """The checked experiment of a TOML file.
+
+    output : where its results go, if not where the file says.
 
     Raises ConfigError naming file and key for anything unknown, of a wrong type, or a point that is listed twice.
     """
     config = validated(ExperimentConfig, read_toml(file), str(file))
     base = file.parent / config.experiment.base
-    output = Path(os.path.normpath(file.parent / config.experiment.output))
+    output = output or Path(os.path.normpath(file.parent / config.experiment.output))
     data = read_config(base)
     points = list(expand(config, str(file)))
     runs = []

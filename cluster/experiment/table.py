@@ -40,6 +40,7 @@ MEASURES: dict[str, Callable[[Record], Any]] = {
     "points": _count("points"),
     "visibility_bytes": _bytes("VISIBILITY"),
     "render_points_bytes": _bytes("RENDER_POINTS"),
+    "sent_bytes": lambda record: sum(of["bytes"] for of in record["messages"].values()) / record["frames"],
     "peak_rss_bytes": lambda record: max(rank["peak_rss_bytes"] for rank in record["ranks"]),
     "ranks": lambda record: len(record["ranks"]),
     "scene_points": lambda record: record["scene"]["points"],

@@ -6,20 +6,27 @@ No calibration run has the settings of the run that is predicted: other pixel th
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ...shared.config import RunConfig, load_config, parse_config, refuse_layers
+from ...shared.framebuffer_runs import encode_runs, merge_runs
+from ...shared.messages import FRAMEBUFFER_EMPTY
 from ..experiment.config import ExperimentConfig, ExperimentSection
 from ..experiment.grid import Experiment, Point
 from ..experiment.journal import Journal
 from ..job import Job
 from ..launch import mpi_available
 from .costs import Costs, Measured, fit_costs
-from .forecast import Machine, fit_messages
-from .workload import NO_LAYERS, Workload, count_workload
+from .forecast import fit_messages
+from .machine import Machine
+from .parts import CountedParts
+from .workload import NO_LAYERS, count_workload
 
 THRESHOLDS_PX = (4.0, 16.0)
 """Of the calibration of a run that draws every point (threshold 0); of others half and double theirs."""
@@ -101,17 +108,45 @@ def measured_points(experiment: Experiment, journal: Journal, *, best: bool = Fa
             records.setdefault(run.point, []).append(run.record)
     if best:
         records = {i: [max(done, key=lambda record: record["frames_per_s"])] for i, done in records.items()}
-    loads: dict[str, Workload] = {}
+    parts: dict[str, CountedParts] = {}
     out = {}
     for i, done in sorted(records.items()):
         run = experiment.runs[i]
         key = run.model_dump_json(exclude={"pipeline": True, "render": {"threads"}, "output": {"directory"}})
-        if key not in loads:
-            loads[key] = count_workload(Job(run))
-        out[i] = Measured(run, loads[key], done)
+        if key not in parts:
+            job = Job(run)
+            parts[key] = CountedParts(job, count_workload(job))
+        out[i] = Measured(run, parts[key].whole, done, parts[key])
     return out
 
 
 def all_costs(runs: Sequence[Measured], machine: Machine) -> Costs:
     """Stages, contention and messages from calibration runs."""
-    return fit_messages(fit_costs(runs), runs, machine)
+    return fit_messages(replace(fit_costs(runs), **framebuffer_costs()), runs, machine)
+
+
+def framebuffer_costs(n_pixels: int = 640 * 1600) -> dict[str, float]:
+    """What putting framebuffers into messages and taking them out costs here: fields of ``Costs``, by name.
+
+    From a framebuffer of background and one with a fifth of its pixels, in runs, drawn on.  Cost: 0.1 s.
+    """
+    empty = np.full(n_pixels, FRAMEBUFFER_EMPTY, np.uint64)
+    drawn = empty.copy()
+    drawn.reshape(-1, 640)[:, :128] = np.arange(n_pixels // 5, dtype=np.uint64).reshape(-1, 128)
+    payload = encode_runs(drawn).tobytes()
+    pixel_s = _fastest_s(lambda: encode_runs(empty)) / n_pixels
+    words = n_pixels // 5
+    return {
+        "encode_pixel_s": pixel_s,
+        "encode_word_s": max(_fastest_s(lambda: encode_runs(drawn)) - pixel_s * n_pixels, 0.0) / words,
+        "merge_word_s": _fastest_s(lambda: merge_runs(payload, drawn.copy())) / words,
+    }
+
+
+def _fastest_s(work: Callable[[], object]) -> float:
+    times = []
+    for _ in range(5):
+        started = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - started)
+    return min(times)

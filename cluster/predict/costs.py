@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,8 @@ from ...nodes.raster.framebuffers import MERGED_PIXELS_PER_POINT
 from ...shared.config import RunConfig
 from ...shared.errors import InputError
 from ...shared.views import VIEWS_PER_PICTURE
+from .parts import EvenParts, Parts
+from .setting import Setting
 from .workload import Workload, threads_of
 
 CONTENTIONS = np.linspace(0, 1.5, 151)
@@ -64,6 +66,8 @@ class Costs:
     contention : slow-down of a busy core by each other busy core, ≥ 0.
     late_s : seconds a frame that a rank with a thread on every core loses where other ranks share the cores: a thread
         that is woken on a core where one is working waits there for the next tick of the operating system.
+    encode_pixel_s, encode_word_s, merge_word_s : of a framebuffer that crosses between ranks: a pixel looked at, a word
+        that is not background put into the message, and taken out of it into the picture.
     """
 
     stages: dict[str, StageCost]
@@ -71,6 +75,9 @@ class Costs:
     message_s: float
     contention: float
     late_s: float = 0.0
+    encode_pixel_s: float = 1e-9
+    encode_word_s: float = 1e-9
+    merge_word_s: float = 10e-9
 
 
 @dataclass(frozen=True)
@@ -80,6 +87,12 @@ class Measured:
     config: RunConfig
     load: Workload
     records: Sequence[dict[str, Any]]
+    counted: Parts | None = None
+
+    @property
+    def parts(self) -> Parts:
+        """What falls to each of several ranks; even where nobody has counted it."""
+        return self.counted or EvenParts(self.load)
 
     @property
     def topology(self) -> str:
@@ -90,6 +103,11 @@ class Measured:
     def threads(self) -> int:
         """Threads of the render rank."""
         return threads_of(self.config.render.threads)
+
+    @property
+    def setting(self) -> Setting:
+        """How it was laid out."""
+        return replace(Setting.of(self.config, len(self.records[0].get("ranks", ()))), topology=self.topology)
 
     @property
     def frames_per_s(self) -> list[float]:

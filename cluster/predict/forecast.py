@@ -1,7 +1,4 @@
-"""Costs and workload → what a run would do: stage times on the ranks and cores it has, then the recurrence.
-
-**Ranks.** ``single`` is one rank whose work is the sum of the stages; ``pipelined`` three. A rank pays the software
-latency of each message it sends or receives; a message's bytes are under way for bytes / bandwidth.
+"""Costs and parts → what a run would do: the steps of every rank and link on the cores there are, then the recurrence.
 
 **Cores that ranks share.** While a stage works, b cores are busy: its own threads, and the threads of each other rank
 for the share of time that it works. Its work then takes max(1, b / cores) · (1 + contention · (min(b, cores) − 1))
@@ -12,18 +9,20 @@ is a mean-value model: it knows neither which frames meet nor how the kernel of 
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .costs import STAGES, Costs, Measured, stage_columns
+from ..topologies import FRAME_PARALLEL
+from .costs import STAGES, Costs, Measured
+from .machine import Machine
+from .parts import EvenParts, Parts
 from .recurrence import Schedule, Stage, run_schedule
+from .setting import Setting
+from .steps import Step, Steps, largest_part, stage_parts
 from .workload import Workload
-
-MESSAGES = {"culling": 4, "sampling": 3, "render": 3}
-"""Messages a frame that each rank of ``pipelined`` sends and receives: two cameras, bits and a note; camera, bits and
-render-points; camera, render-points and a note."""
 
 ROUNDS = 30
 LOSSES_S = np.concatenate([[0.0], np.geomspace(5e-6, 10e-3, 100)])
@@ -31,37 +30,16 @@ LOSSES_S = np.concatenate([[0.0], np.geomspace(5e-6, 10e-3, 100)])
 
 
 @dataclass(frozen=True)
-class Machine:
-    """What a run has.
-
-    cores : that its ranks share.
-    bandwidth_bytes_per_s : of messages between ranks.
-    speed : of a core, 1 being the measured one.
-    """
-
-    cores: int
-    bandwidth_bytes_per_s: float = 10e9
-    speed: float = 1.0
-
-
-@dataclass(frozen=True)
-class Setting:
-    """How a run is laid out."""
-
-    topology: str
-    threads: int
-    in_flight: int
-
-
-@dataclass(frozen=True)
 class Forecast:
     """The predicted run.
 
-    inflation : rank → how many times longer its work takes than alone.
+    steps : what its ranks and links have to do.
+    inflation : rank's role → how many times longer its work takes than alone.
     """
 
     setting: Setting
     schedule: Schedule
+    steps: Sequence[Step]
     inflation: dict[str, float]
 
     @property
@@ -74,42 +52,83 @@ class Forecast:
         """Median over the frames."""
         return 1e3 * float(np.median(self.schedule.latency_s))
 
+    @property
+    def limit(self) -> tuple[str, str]:
+        """(rank's role or link, inequality) that bounds the rate: the largest part of what is busiest."""
+        busiest = self.schedule.bottleneck
+        return busiest, largest_part([step for step in self.steps if step.on == busiest])
 
-def forecast(costs: Costs, load: Workload, setting: Setting, machine: Machine) -> Forecast:
-    """The prediction for a workload on a setting and a machine. Cost: some ms a hundred frames."""
-    columns = stage_columns(load, setting.threads)
-    alone = {stage: costs.stages[stage].of(columns[stage]) / machine.speed for stage in STAGES}
-    threads = {"culling": 1.0, "sampling": 1.0, "render": float(setting.threads)}
-    loop_s, message_s = costs.loop_s / machine.speed, costs.message_s / machine.speed
-    if setting.topology == "single":
-        factor = {stage: _inflation(threads[stage], costs.contention, machine.cores) for stage in STAGES}
-        work = loop_s + sum(alone[stage] * factor[stage] for stage in STAGES)
-        schedule = run_schedule([Stage("single", np.asarray(work))], in_flight=1)
-        return Forecast(setting, schedule, {"single": factor["render"]})
-    links = {
-        "culling": load.visibility_bytes / machine.bandwidth_bytes_per_s,
-        "sampling": float(load.render_points_bytes.mean()) / machine.bandwidth_bytes_per_s,
-        "render": 0.0,
-    }
-    fixed = {stage: MESSAGES[stage] * message_s + (loop_s if stage == "culling" else 0.0) for stage in STAGES}
-    factor: dict[str, float] = dict.fromkeys(STAGES, 1.0)
-    crowded = setting.threads >= machine.cores > 1
-    one_thread = costs.stages["render"].of(stage_columns(load, 1)["render"]) / machine.speed
+
+def forecast(costs: Costs, load: Workload | Parts, setting: Setting, machine: Machine) -> Forecast:
+    """The prediction for a workload on a setting and a machine. Cost: some ms a hundred frames and rank.
+
+    load : a workload is dealt evenly to ranks.
+    """
+    parts = EvenParts(load) if isinstance(load, Workload) else load
+    if setting.topology == FRAME_PARALLEL:
+        return _whole_pictures(costs, parts.whole, setting, machine)
+    made = Steps(setting, parts, costs, machine, threads=setting.threads)
+    steps, layout = made.steps, made.layout
+    one = Steps(setting, parts, costs, machine).steps if setting.threads > 1 else steps
+    n_frames = parts.whole.n_frames
+    work = [step.seconds(n_frames, waiting=False) for step in steps]
+    waiting = [step.seconds(n_frames, working=False) for step in steps]
+    by_one = [step.seconds(n_frames, waiting=False) for step in one]
+    pools = [None if step.rank is None else machine.pool_of(step.rank) for step in steps]
+    crowded = len({rank for rank in layout.workers if machine.pool_of(rank) == machine.pool_of(0)}) > 1
+    factor = [_inflation(step.threads, costs.contention, machine.cores) for step in steps]
     for _ in range(ROUNDS):
-        work = {s: alone[s] * factor[s] for s in STAGES}
-        if crowded:
-            work["render"] = np.minimum(work["render"] + costs.late_s, one_thread * factor["render"])
-        stages = [Stage(s, work[s] + fixed[s], link_s=links[s]) for s in STAGES]
-        schedule = run_schedule(stages, in_flight=setting.in_flight)
-        busy = {s: float(alone[s].sum()) * factor[s] / schedule.total_s * threads[s] for s in STAGES}
-        wanted = {
-            s: _inflation(threads[s] + sum(busy[o] for o in STAGES if o != s), costs.contention, machine.cores)
-            for s in STAGES
-        }
-        if all(abs(wanted[s] - factor[s]) < 1e-4 for s in STAGES):
+        stages = []
+        for i, step in enumerate(steps):
+            cost = work[i] * factor[i]
+            if crowded and step.draws and step.threads >= machine.cores > 1:
+                cost = np.minimum(cost + costs.late_s, by_one[i] * factor[i])
+            stages.append(Stage(step.on, cost + waiting[i], link_s=step.link_s, after=step.after))
+        schedule = run_schedule(stages, in_flight=setting.in_flight if len(layout.workers) > 1 else 1)
+        busy: dict[tuple[int | None, int | None], float] = {}
+        for i, step in enumerate(steps):
+            share = float(work[i].sum()) * factor[i] / schedule.total_s * step.threads if schedule.total_s else 0.0
+            for key in ((pools[i], step.rank), (pools[i], None)):
+                busy[key] = busy.get(key, 0.0) + share
+        wanted = [
+            _inflation(s.threads + busy[pool, None] - busy[pool, s.rank], costs.contention, machine.cores)
+            if s.threads
+            else 1.0
+            for s, pool in zip(steps, pools, strict=True)
+        ]
+        if all(abs(w - f) < 1e-4 for w, f in zip(wanted, factor, strict=True)):
             break
-        factor = {s: (wanted[s] + factor[s]) / 2 for s in STAGES}
-    return Forecast(setting, schedule, factor)
+        factor = [(w + f) / 2 for w, f in zip(wanted, factor, strict=True)]
+    return Forecast(setting, schedule, steps, {s.on: f for s, f in zip(steps, factor, strict=True) if s.threads})
+
+
+def _whole_pictures(costs: Costs, load: Workload, setting: Setting, machine: Machine) -> Forecast:
+    """Each rank draws every n-th frame, as ``single`` would, and tells rank 0."""
+    n = setting.size
+    here = max(Counter(machine.pool_of(rank) for rank in range(n)).values())
+    steps = [picture_step(costs, load, machine, setting.threads, here, told) for told in (n - 1, min(n - 1, 1))]
+    first, other = (step.seconds(load.n_frames) for step in steps)
+    cost = np.where(np.arange(load.n_frames) % n == 0, first, other)
+    schedule = run_schedule([Stage("pictures", cost, workers=n)], in_flight=load.n_frames)
+    return Forecast(
+        setting,
+        schedule,
+        steps[:1],
+        {"pictures": _inflation(here - 1 + setting.threads, costs.contention, machine.cores)},
+    )
+
+
+def picture_step(costs: Costs, load: Workload, machine: Machine, threads: int, here: int, messages: int) -> Step:
+    """What a rank of ``frame-parallel``, one of ``here`` on its cores, has to do of a frame that is its own."""
+    step = Step("pictures", 0, ())
+    step.add("work", costs.loop_s / machine.speed)
+    for stage in STAGES:
+        of_stage = threads if stage == "render" else 1
+        slower = _inflation(here - 1 + of_stage, costs.contention, machine.cores)
+        for name, seconds in stage_parts(costs, stage, load, of_stage).items():
+            step.add(name, seconds * slower / machine.speed)
+    step.add("messages", costs.message_s / machine.speed * messages)
+    return step
 
 
 def fit_messages(costs: Costs, runs: Sequence[Measured], machine: Machine) -> Costs:
@@ -132,8 +151,7 @@ def fit_messages(costs: Costs, runs: Sequence[Measured], machine: Machine) -> Co
 
 def _error(costs: Costs, run: Measured, machine: Machine) -> float:
     """(predicted − measured) / measured frames/s."""
-    setting = Setting(run.topology, run.threads, run.config.pipeline.frames_in_flight)
-    return forecast(costs, run.load, setting, machine).frames_per_s * run.frame_s - 1
+    return forecast(costs, run.load, run.setting, machine).frames_per_s * run.frame_s - 1
 
 
 def _inflation(busy: float, contention: float, cores: int) -> float:

@@ -1,4 +1,4 @@
-"""k : m : n ranks on paper: the stages divided, the messages multiplied, the pictures composited.
+"""Which k : m : n ranks suit a scene: the stages divided, the messages multiplied, in closed form.
 
 Subtrees go to k culling and m sampling ranks, points to n render ranks; every rank has a machine's core or cores of its
 own, and subtrees are equally full. A selection rank still pays a frame's constant; a render rank still merges a whole
@@ -13,7 +13,7 @@ import math
 from dataclasses import dataclass
 
 from .costs import STAGES, Costs, stage_columns
-from .forecast import Machine
+from .machine import Machine
 from .workload import Workload
 
 WORD_BYTES = 8
@@ -107,16 +107,6 @@ def best_split(costs: Costs, load: Workload, machine: Machine, ranks: int) -> Sp
                 renders = {left, *(size for size in sizes if size < left)}
                 options += [split_costs(costs, load, machine, k, m, n) for n in renders]
     return max(options, key=lambda split: (split.frames_per_s, -split.ranks))
-
-
-def scaling(costs: Costs, load: Workload, machine: Machine, largest: int) -> dict[int, Split]:
-    """Ranks there are, 4, 8, … ``largest`` → the best split of at most so many."""
-    splits: dict[int, Split] = {}
-    best: list[Split] = []
-    for ranks in [*(n for n in (2**i for i in range(2, 20)) if n < largest), max(largest, 3)]:
-        best = [max([*best, best_split(costs, load, machine, ranks)], key=lambda split: split.frames_per_s)]
-        splits[ranks] = best[0]
-    return splits
 
 
 def _divided(parts: dict[str, float], ranks: int) -> float:

@@ -11,14 +11,19 @@ from ..experiment.grid import describe
 from ..report import Report
 from .costs import Costs
 from .forecast import Forecast
-from .hybrid import Split
+from .parts import MOST_COUNTED
+from .scaling import OnPaper
 from .validate import MEDIAN_GOAL, WORST_GOAL, Comparison, errors
 
 ASSUMPTIONS = (
     "Stage costs are linear in cells, entries, points and pixels; on cores that ranks share, work takes busy cores / "
     "cores times as long, and each further busy core slows the others by the fitted contention. Output is off: "
-    "encoding pictures and films is not predicted. Message bytes travel at an assumed 10 GB/s unless told otherwise."
+    "encoding pictures and films is not predicted. Bytes between ranks of a host travel at an assumed 10 GB/s unless "
+    "told otherwise, those between hosts at the rate of their links."
 )
+
+MOST_SHOWN = 4
+"""Ranks and links whose utilisation a row says."""
 
 BEST = " Of each setting the fastest repeat counts: the machine was shared, and what others take only ever slows a run."
 
@@ -43,40 +48,43 @@ def add_forecasts(report: Report, forecasts: Sequence[tuple[str, Forecast]]) -> 
     base = forecasts[0][1].frames_per_s
     rows = []
     for name, found in forecasts:
-        use = ", ".join(f"{stage} {share:.0%}" for stage, share in found.schedule.utilisation.items())
-        setting = f"{found.setting.topology}, {found.setting.threads} threads"
-        bottleneck = found.schedule.bottleneck
-        rows.append([name, setting, found.frames_per_s, found.frames_per_s / base, found.latency_ms, bottleneck, use])
-    report.table(["case", "setting", "frames/s", "of the first", "latency, ms", "bottleneck", "utilisation"], rows)
+        shares = sorted(found.schedule.utilisation.items(), key=lambda of: -of[1])[:MOST_SHOWN]
+        use = ", ".join(f"{on} {share:.0%}" for on, share in shares)
+        setting = f"{found.setting.topology}, {found.setting.size} ranks, {found.setting.threads} threads"
+        rate = found.frames_per_s
+        rows.append([name, setting, rate, rate / base, found.latency_ms, *found.limit, use])
+    columns = ["case", "setting", "frames/s", "of the first", "latency, ms", "bottleneck", "inequality", "busiest"]
+    report.table(columns, rows)
 
 
-def add_ranks(report: Report, cases: dict[str, dict[int, Split]]) -> None:
-    """Case → ranks → best split: all of the first case, the most ranks of the others, a curve for each."""
+def add_scaling(report: Report, cases: dict[str, dict[str, dict[int, OnPaper]]]) -> None:
+    """Case → topology → ranks → what it would do: all of the first case with a curve each, the most of the others."""
     from matplotlib.figure import Figure
 
-    report.heading("On paper: k culling, m sampling, n render ranks")
+    report.heading("On paper: every topology on more ranks")
     report.text(
-        "Each rank with a core of its own and its share of subtrees or points, messages as dear as measured here, "
-        "pictures composited by binary swap. No more ranks are used than pay. The limit is the largest part of the "
-        "slowest kind of rank, and the condition of the thesis (3.3.1) that it breaks first."
+        "Each rank with a core and a link of its own and one thread, its part counted from the scene as far as "
+        f"{MOST_COUNTED} ranks and continued from there, messages as dear as measured here, framebuffers sent to the "
+        "display rank. The limit is what has most to do in a frame, and the condition of the thesis (3.3.1) that the "
+        "largest part of that breaks first."
     )
-    columns = ["case", "ranks", "used, k : m : n", "frames/s", "latency, ms", "limiting stage", "limiting inequality"]
     rows = [
-        [case, ranks, f"{s.k} : {s.m} : {s.n}", s.frames_per_s, 1e3 * s.latency_s, *s.limit]
-        for i, (case, splits) in enumerate(cases.items())
-        for ranks, s in splits.items()
-        if i == 0 or ranks == max(splits)
+        [case, found.said, ranks, found.frames_per_s, 1e3 * found.latency_s, *found.limit]
+        for i, (case, topologies) in enumerate(cases.items())
+        for of_topology in topologies.values()
+        for ranks, found in of_topology.items()
+        if i == 0 or ranks == max(of_topology)
     ]
-    report.table(columns, rows)
+    report.table(["case", "topology", "ranks", "frames/s", "latency, ms", "limiting", "limiting inequality"], rows)
     figure = Figure(figsize=(6, 4))
     axes = figure.add_subplot()
-    for case, splits in cases.items():
-        axes.loglog(list(splits), [s.frames_per_s for s in splits.values()], marker="o", markersize=3, label=case)
+    for topology, found in next(iter(cases.values())).items():
+        axes.loglog(list(found), [of.frames_per_s for of in found.values()], marker="o", markersize=3, label=topology)
     axes.set_xlabel("ranks")
     axes.set_ylabel("frames/s, predicted")
     axes.grid(alpha=0.3, which="both")
     axes.legend(fontsize="small")
-    report.plot(figure, "Predicted frames/s of the best split of so many ranks")
+    report.plot(figure, "Predicted frames/s of every topology on so many ranks")
 
 
 def add_comparisons(report: Report, comparisons: Sequence[Comparison]) -> None:
@@ -95,11 +103,11 @@ def add_comparisons(report: Report, comparisons: Sequence[Comparison]) -> None:
             f"{min(c.measured):.4g}–{max(c.measured):.4g}",
             c.predicted.frames_per_s,
             f"{c.error:+.1%}",
-            c.predicted.schedule.bottleneck,
+            *c.predicted.limit,
         ]
         for c in comparisons
     ]
-    report.table(["setting", "measured, frames/s", "spread", "predicted", "error", "bottleneck"], rows)
+    report.table(["setting", "measured, frames/s", "spread", "predicted", "error", "bottleneck", "inequality"], rows)
     if comparisons:
         report.plot(_scatter(comparisons), "Predicted over measured; the band is the goal for the worst")
 
@@ -111,7 +119,7 @@ def _scatter(comparisons: Sequence[Comparison]) -> Any:
     figure = Figure(figsize=(5, 5))
     axes = figure.add_subplot()
     x = np.array([np.median(c.measured) for c in comparisons])
-    for topology in ("single", "pipelined"):
+    for topology in dict.fromkeys(c.predicted.setting.topology for c in comparisons):
         own = [i for i, c in enumerate(comparisons) if c.predicted.setting.topology == topology]
         axes.loglog(x[own], [comparisons[i].predicted.frames_per_s for i in own], "o", label=topology)
     ends = np.array([x.min() / 1.5, x.max() * 1.5])

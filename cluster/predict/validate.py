@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from ..experiment.grid import Experiment, Point
 from .calibrate import all_costs
 from .costs import Costs, Measured
-from .forecast import Forecast, Machine, Setting, forecast
+from .forecast import Forecast, forecast
+from .machine import Machine
 
 MEDIAN_GOAL, WORST_GOAL = 0.15, 0.30
 
@@ -19,10 +21,11 @@ MEDIAN_GOAL, WORST_GOAL = 0.15, 0.30
 class Comparison:
     """One point of the experiment.
 
-    measured : frames/s of each repeat.
+    records : of the repeats.  measured : frames/s of each.
     """
 
     point: Point
+    records: Sequence[dict[str, Any]]
     measured: list[float]
     predicted: Forecast
 
@@ -43,8 +46,8 @@ def compare(
     out = []
     for i, run in measured.items():
         if i < n_points:
-            setting = Setting(run.topology, run.threads, run.config.pipeline.frames_in_flight)
-            out.append(Comparison(experiment.points[i], run.frames_per_s, forecast(costs, run.load, setting, machine)))
+            found = forecast(costs, run.parts, run.setting, machine)
+            out.append(Comparison(experiment.points[i], run.records, run.frames_per_s, found))
     return out, costs
 
 

@@ -3,8 +3,10 @@
 Any key of a run's configuration, or one of
 
 =================  ==================================================================
-``cores``          that the ranks share
-``bandwidth``      of messages between ranks, bytes a second
+``cores``          that the ranks of a host share
+``hosts``          that ranks are dealt to, each with cores of its own
+``bandwidth``      of messages between ranks of a host, bytes a second
+``link``           bandwidth of a host's link to the others, each way, bytes a second
 ``latency``        software latency of a message, seconds
 ``speed``          of a core, 1 being this one
 ``points``         of the scene; cells, entries and points drawn grow alike
@@ -18,12 +20,14 @@ from dataclasses import dataclass, replace
 from ...shared.config import RunConfig, load_config
 from ...shared.errors import InputError
 from ..job import Job
-from ..launch import mpi_available
 from .costs import Costs
-from .forecast import Forecast, Machine, Setting, forecast
-from .workload import Workload, count_workload, threads_of
+from .forecast import Forecast, forecast
+from .machine import Machine
+from .parts import CountedParts, EvenParts, Parts
+from .setting import Setting
+from .workload import Workload, count_workload
 
-FIGURES = ("cores", "bandwidth", "latency", "speed", "points")
+FIGURES = ("cores", "hosts", "bandwidth", "link", "latency", "speed", "points")
 
 
 @dataclass(frozen=True)
@@ -35,18 +39,27 @@ class Case:
     load: Workload
     machine: Machine
     scene_points: int
+    counted: Parts | None = None
+
+    @classmethod
+    def of(cls, job: Job, costs: Costs, machine: Machine) -> Case:
+        """A job's, its parts counted when they are asked for."""
+        load = count_workload(job)
+        return cls(job.config, costs, load, machine, job.scene.info.n_points, CountedParts(job, load))
+
+    @property
+    def parts(self) -> Parts:
+        """What falls to each of several ranks."""
+        return self.counted or EvenParts(self.load)
 
     @property
     def setting(self) -> Setting:
         """The layout that the configuration asks for."""
-        topology = self.run.pipeline.topology
-        if topology == "auto":
-            topology = "pipelined" if mpi_available() else "single"
-        return Setting(topology, threads_of(self.run.render.threads), self.run.pipeline.frames_in_flight)
+        return Setting.of(self.run, self.machine.hosts)
 
     def predict(self) -> Forecast:
         """The forecast as it stands."""
-        return forecast(self.costs, self.load, self.setting, self.machine)
+        return forecast(self.costs, self.parts, self.setting, self.machine)
 
 
 def changed(case: Case, config: str, overrides: list[str], change: str) -> Case:
@@ -61,14 +74,17 @@ def changed(case: Case, config: str, overrides: list[str], change: str) -> Case:
         run = load_config(config, [*overrides, change])
         if run.render.rasterizer != case.run.render.rasterizer:
             raise InputError(f"--what-if {change}: the costs are of rasterizer {case.run.render.rasterizer}")
-        job = Job(run)
-        return replace(case, run=run, load=count_workload(job), scene_points=job.scene.info.n_points)
+        return Case.of(Job(run), case.costs, case.machine)
     if key not in FIGURES:
         raise InputError(f"--what-if {change}: expected a key of the configuration or one of {', '.join(FIGURES)}")
     value = _positive(change, text)
     match key:
         case "cores":
             return replace(case, machine=replace(case.machine, cores=max(int(value), 1)))
+        case "hosts":
+            return replace(case, machine=replace(case.machine, hosts=max(int(value), 1), shared_cores=False))
+        case "link":
+            return replace(case, machine=replace(case.machine, link_bytes_per_s=value))
         case "bandwidth":
             return replace(case, machine=replace(case.machine, bandwidth_bytes_per_s=value))
         case "speed":
@@ -76,7 +92,8 @@ def changed(case: Case, config: str, overrides: list[str], change: str) -> Case:
         case "latency":
             return replace(case, costs=replace(case.costs, message_s=value))
         case _:
-            return replace(case, load=case.load.scaled(value / case.scene_points), scene_points=int(value))
+            load = case.load.scaled(value / case.scene_points)
+            return replace(case, load=load, scene_points=int(value), counted=None)
 
 
 def _positive(change: str, text: str) -> float:
