@@ -13,6 +13,7 @@ from typing import Annotated, Any
 
 import typer
 
+from ..shared.byte_size import parse_bytes
 from ..shared.compile_cache import ensure_compile_cache
 from ..shared.errors import InputError, SplatpipeError
 from ..shared.files import DISK_FULL
@@ -581,29 +582,3 @@ def parse_numbers(text: str, option: str, count: int | None = None) -> list[floa
     if not values or not all(0 < value < 2**20 for value in values) or count not in (None, len(values)):
         raise InputError(f"{option} {text}: expected {count or 'some'} numbers above 0")
     return values
-
-
-def parse_bytes(text: str, option: str) -> int:
-    """Bytes of ``4GB``, ``500 MB``, ``2GiB`` or a plain number. Raises InputError naming the option."""
-    units = {
-        "": 1,
-        "B": 1,
-        "K": 1e3,
-        "KB": 1e3,
-        "M": 1e6,
-        "MB": 1e6,
-        "G": 1e9,
-        "GB": 1e9,
-        "T": 1e12,
-        "TB": 1e12,
-    }
-    units |= {"KIB": 2**10, "MIB": 2**20, "GIB": 2**30, "TIB": 2**40}
-    digits = text.strip().rstrip("BKMGTIbkmgti ")
-    unit = text.strip()[len(digits) :].strip().upper()
-    try:
-        value = float(digits) * units[unit]
-    except (ValueError, KeyError):
-        raise InputError(f"{option} {text}: expected a size such as 500MB or 4GiB") from None
-    if not 0 < value < 2**60:
-        raise InputError(f"{option} {text}: expected a size above 0")
-    return int(value)

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from ..nodes.layer_render import LayerRenderNode
     from ..nodes.layer_sampling import LayerSamplingNode
     from ..nodes.raster.group_raster import ResidentGroups
+    from ..nodes.raster.paged import PagedPoints, Paging, Residency
     from ..shared.layers.layer import Layer
 
 SPLAT_COLOUR = "#d0d0d0"
@@ -56,6 +57,7 @@ class Job:
         check_topology(config)
         self.config = config
         self.threads = config.render.threads or len(os.sched_getaffinity(0))
+        self.paged = config.memory.residency == "paged"
         self.layers = self._read_layers() if config.layers else []
         self.scene = scene or self._open_scene()
         info = self.scene.info
@@ -84,6 +86,7 @@ class Job:
             groups=self.coded,
             pools=self.pools != "off",
             point_filter=self.point_filter,
+            paging=self._paging() if self.paged else None,
         )
         self.wanted.check(self.scene)
         check_style(render.rasterizer, self.splats, groups=self.coded)
@@ -107,6 +110,13 @@ class Job:
         if config.output.mp4 and not self.background[3]:
             raise ConfigError("render.background = 'transparent', expected a colour: a film (output.mp4) has no alpha")
 
+    def _paging(self) -> Paging:
+        from ..nodes.raster.paged import Paging
+        from .paging import check_paging
+
+        check_paging(self.config, self.scene.info)
+        return Paging(self.config.memory.budget_bytes, self.config.memory.complete)
+
     def _why_no_pools(self) -> str:
         """Why this run draws nothing from pools; empty if it may."""
         config = self.config
@@ -123,7 +133,7 @@ class Job:
     @property
     def rasterizer(self) -> str:
         """Name of the rasterizer that draws, ``auto`` resolved."""
-        return "cpu" if self.coded else resolve_rasterizer(self.config.render.rasterizer)
+        return "cpu" if self.coded or self.paged else resolve_rasterizer(self.config.render.rasterizer)
 
     @property
     def position_bytes(self) -> float:
@@ -138,6 +148,11 @@ class Job:
     def attribute_bytes(self) -> int:
         """Bytes of a point's colour, and of a splat's normal and radius."""
         return (0 if self.colouring.mode == "constant" else 4) + (5 if self.splats else 0)
+
+    @property
+    def frames_ahead(self) -> int:
+        """How many frames the render rank is told of before it is their turn (``RenderStage.expect``)."""
+        return self.frames_in_flight - 1 if self.paged and self.config.memory.prefetch else 0
 
     def load_octree(self) -> Octree:
         """The cells, with what the sampling node of this run needs of them. Raises StoreError."""
@@ -182,7 +197,7 @@ class Job:
 
     def _open_scene(self) -> Scene:
         if self.config.scene.path:
-            return Scene.open(Path(os.path.normpath(self.config.scene.path)))
+            return Scene.open(Path(os.path.normpath(self.config.scene.path)), mapped=not self.paged)
         from ..shared.empty_scene import EmptyScene
 
         corners = [layer.bounds for layer in self.layers]
@@ -209,11 +224,11 @@ class Job:
         """The points of this run, with what it needs of them; coded ones are decoded. Raises StoreError."""
         return load_points(self.scene, self.colouring, self.wanted, verify=verify)
 
-    def load_drawn(self, scene: Scene | None = None, *, verify: bool) -> ResidentPoints | ResidentGroups:
+    def load_drawn(self, scene: Scene | None = None, *, verify: bool) -> ResidentPoints | ResidentGroups | PagedPoints:
         """The points of this run, or of a share of its scene, in the form it draws them from. Raises StoreError."""
         return load_drawn(scene or self.scene, self.colouring, self.wanted, verify=verify)
 
-    def make_rasterizer(self, points: ResidentPoints | ResidentGroups) -> Rasterizer:
+    def make_rasterizer(self, points: ResidentPoints | ResidentGroups | PagedPoints) -> Rasterizer:
         """The rasterizer of this run over ``points``; the caller closes it. Raises DeviceError."""
         render = self.config.render
         return make_rasterizer(
@@ -242,7 +257,9 @@ class Job:
             rasterizer = stack.enter_context(self.make_rasterizer(points))
             self.scene.release()
             node = RenderNode(rasterizer)
-            if rasterizer.name == "cpu" and not kernels_cached(pools=self.wanted.pools, groups=self.coded):
+            if rasterizer.name == "cpu" and not kernels_cached(
+                pools=self.wanted.pools, groups=self.coded, paged=self.paged
+            ):
                 progress("compiling kernels (once; kept for the next run)", 0)
             node.warm_up(self.camera(0))
             layers = None
@@ -255,7 +272,7 @@ class Job:
                 composer = stack.enter_context(Composer(self.picture_settings))
                 composer.warm_up([self.camera(view) for view in range(self.views.per_picture)])
                 sink = stack.enter_context(FrameSink(self.output, png=output.png, mp4=output.mp4, fps=output.fps))
-            yield RenderStage(node, layers, composer, sink, self.views.per_picture)
+            yield RenderStage(node, layers, composer, sink, self.views.per_picture, self.frames_ahead)
 
     @contextmanager
     def _open_layers(self) -> Iterator[LayerRenderNode]:
@@ -326,12 +343,14 @@ class RenderStage:
         composer: Composer | None,
         sink: FrameSink | None,
         per_picture: int,
+        frames_ahead: int = 0,
     ) -> None:
         self._node = node
         self._layers = layers
         self._composer = composer
         self._sink = sink
         self._per_picture = per_picture
+        self.frames_ahead = frames_ahead
         self.description = " + ".join(part.description for part in (node, layers) if part)
 
     def draw(self, camera: Camera, chosen: RenderPoints, of_layers: Sequence[RenderPoints] = ()) -> Picture | None:
@@ -344,6 +363,15 @@ class RenderStage:
         if self._layers is not None:
             words = self._layers.process(camera, of_layers, words)
         return words
+
+    def expect(self, chosen: RenderPoints) -> None:
+        """Say what a frame that follows will draw; asked for up to ``frames_ahead`` frames, in order."""
+        self._node.expect(chosen)
+
+    @property
+    def residency(self) -> Residency | None:
+        """What the last frame found of paged points; None where points are resident."""
+        return self._node.residency
 
     def compose(self, camera: Camera, words: np.ndarray) -> Picture | None:
         """The picture that the words of a frame complete, as of ``draw``."""

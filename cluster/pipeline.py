@@ -9,20 +9,24 @@ the scene is delivered by messages, the sampling rank reads the render rank's ha
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from ..shared.camera import Camera
 from ..shared.config import RunConfig
 from ..shared.messages import (
     RENDER_POINT,
     Kind,
+    RenderPoints,
     decode_camera,
     decode_render_points,
     decode_visibility,
 )
 from .delivery import receive_scene, serve_scene
 from .job import Job
+from .paging import told_ahead
 from .record import FrameCounts, StageClock, rank_record, spread_ms
 from .topologies import PIPELINE_ROLES as ROLES
 from .transport import Transport
@@ -85,7 +89,8 @@ def draw_alone(job: Job, frames: Sequence[int], progress: Progress, ready: Calla
         ready()
         started = time.perf_counter()
         loading_s = started - loading
-        for done, frame in enumerate(frames, 1):
+
+        def select(frame: int) -> tuple[Camera, RenderPoints, list[RenderPoints]]:
             camera = job.camera(frame)
             with clocks[CULLING].working():
                 bits = culling.process(camera)
@@ -93,12 +98,17 @@ def draw_alone(job: Job, frames: Sequence[int], progress: Progress, ready: Calla
             with clocks[SAMPLING].working():
                 chosen = sampling.process(camera, bits)
                 of_layers = [node.process(camera, seen) for (_, node), seen in zip(layers, bits_of_layers, strict=True)]
+            counts.add(bits, chosen)
+            return camera, chosen, of_layers
+
+        selected = told_ahead(map(select, frames), render.frames_ahead, lambda frame: render.expect(frame[1]))
+        for done, (camera, chosen, of_layers) in enumerate(selected, 1):
             with clocks[RENDER].working():
                 picture = render.draw(camera, chosen, of_layers)
             with clocks[RENDER].waiting():
-                render.show(frame, picture)
-            counts.add(bits, chosen)
+                render.show(camera.frame, picture)
             counts.add_layers(of_layers)
+            counts.add_residency(render.residency)
             progress("rendering", done)
         drawn = time.perf_counter()
     return Drawn(clocks, counts, render.times(), render.description, loading_s, started, drawn)
@@ -213,19 +223,32 @@ def _render(job: Job, transport: Transport) -> None:
     most_entries += [len(layer.octree) for layer in job.layers]
     with job.open_render(lambda *_: None) as render:
         transport.meet()
+        ahead: deque[tuple[Camera, RenderPoints, list[RenderPoints]]] = deque()
+
+        def receive() -> None:
+            camera = decode_camera(*transport.receive(CULLING, Kind.CAMERA, _MAX_CAMERA_BYTES))
+            chosen, *of_layers = [
+                decode_render_points(*transport.receive(SAMPLING, Kind.RENDER_POINTS, n * RENDER_POINT.itemsize))
+                for n in most_entries
+            ]
+            ahead.append((camera, chosen, of_layers))
+            if render.frames_ahead:
+                render.expect(chosen)
+
         for frame in range(job.n_frames):
             with clock.waiting():
-                camera = decode_camera(*transport.receive(CULLING, Kind.CAMERA, _MAX_CAMERA_BYTES))
-                chosen, *of_layers = [
-                    decode_render_points(*transport.receive(SAMPLING, Kind.RENDER_POINTS, n * RENDER_POINT.itemsize))
-                    for n in most_entries
-                ]
+                if not ahead:
+                    receive()
+                while len(ahead) <= render.frames_ahead and transport.has_note(SAMPLING, Kind.RENDER_POINTS):
+                    receive()  # frames that are sampled already
+            camera, chosen, of_layers = ahead.popleft()
             with clock.working():
                 picture = render.draw(camera, chosen, of_layers)
             with clock.waiting():
                 render.show(frame, picture)
             counts.add(chosen)
             counts.add_layers(of_layers)
+            counts.add_residency(render.residency)
             transport.send_note(CULLING, Kind.FRAME_DONE, frame)
     statistics = _statistics(transport, clock, counts)
     statistics["per_frame"] |= render.times()

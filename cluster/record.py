@@ -9,13 +9,17 @@ import subprocess
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..shared.messages import RenderPoints, VisibilityBits
+
+if TYPE_CHECKING:
+    from ..nodes.raster.paged import Residency
 
 RECORD_VERSION = 1
 
@@ -71,6 +75,11 @@ class FrameCounts:
         """Count the objects that a frame draws, a number for each layer; nothing where there is no layer."""
         if of_layers:
             self._lists.setdefault("objects", []).append([chosen.n_points for chosen in of_layers])
+
+    def add_residency(self, found: Residency | None) -> None:
+        """Count what a frame found of paged points; nothing where points are resident."""
+        for name, value in (asdict(found) if found else {}).items():
+            self._lists.setdefault(name, []).append(value)
 
     def lists(self) -> dict[str, list[Any]]:
         """Name → one count a frame; ``objects``: one list a frame, a count for each layer."""

@@ -76,6 +76,7 @@ def run_sort_last(job: Job, transport: Transport, progress: Progress) -> dict[st
                     render.show(frame, picture)
                 progress("rendering", frame + 1)
             counts.add(bits, chosen)
+            counts.add_residency(render.residency)
         rendered_s = time.perf_counter() - started
     record = rank_record(role_of(job.config.pipeline, rank), rank) | {
         "first_point": first,
