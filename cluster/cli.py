@@ -51,6 +51,9 @@ def run(
     sets: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a key: output.frames=10.")
     ] = None,
+    complete: Annotated[
+        bool, typer.Option("--complete", help="Paged points: wait for all of a frame; sets memory.complete.")
+    ] = False,
     json: JsonOption = None,
 ) -> None:
     """Draw a camera path: PNG frames, a film, and run.json with where the time went.
@@ -61,7 +64,7 @@ def run(
     """
     from .run import run_command
 
-    raise typer.Exit(run_command(config, sets or [], json))
+    raise typer.Exit(run_command(config, [*(sets or []), *["memory.complete=true"] * complete], json))
 
 
 @app.command()
@@ -111,7 +114,7 @@ def build(
         flatness=flatness,
         memory_bytes=parse_bytes(memory, "--memory") if memory else None,
         up=up,
-        attributes=tuple(name.strip() for name in attributes.split(",")) if attributes else None,
+        attributes=split_names(attributes),
         normals=normals,
         splats=splats,
         features=features,
@@ -136,17 +139,31 @@ def synth(
     splats: Annotated[bool, typer.Option("--splats", help="As for `splatpipe build`.")] = False,
     features: Annotated[bool, typer.Option("--features", help="As for `splatpipe build`.")] = False,
     pools: Annotated[bool, typer.Option("--pools", help="As for `splatpipe build`.")] = False,
+    extent: Annotated[float, typer.Option(help="Side of the city, metres, up to 873.")] = 225.0,
+    memory: Annotated[str, typer.Option(help="As for `splatpipe build`.")] = "",
+    attributes: Annotated[str, typer.Option(help="As for `splatpipe build`.")] = "",
     overwrite: Annotated[bool, typer.Option(help="Replace an existing scene.")] = False,
+    json: JsonOption = None,
 ) -> None:
     """Make a synthetic city scan: a scene directory, or a LAS/LAZ file.
+
+    A scene larger than memory: `splatpipe synth large.scene --points 1000000000 --extent 873 --attributes rgb`
 
     Example: `splatpipe synth city.scene --points 2000000`
     """
     from ..shared.build import BuildSettings
     from .scenes import synth_command
 
-    settings = BuildSettings(overwrite=overwrite, up="z", splats=splats, features=features, pools=pools)
-    synth_command(output, points, seed, settings)
+    settings = BuildSettings(
+        overwrite=overwrite,
+        up="z",
+        splats=splats,
+        features=features,
+        pools=pools,
+        memory_bytes=parse_bytes(memory, "--memory") if memory else None,
+        attributes=split_names(attributes),
+    )
+    synth_command(output, points, seed, extent, settings, json)
 
 
 @app.command()
@@ -571,6 +588,11 @@ def _fail(error: BaseException, message: str, status: int) -> None:
         traceback.print_exception(error)
     print("splatpipe: " + " ".join(message.split("\n")), file=sys.stderr)
     sys.exit(status)
+
+
+def split_names(text: str) -> tuple[str, ...] | None:
+    """The comma-separated names of an option; None for none."""
+    return tuple(name.strip() for name in text.split(",")) if text else None
 
 
 def parse_numbers(text: str, option: str, count: int | None = None) -> list[float]:

@@ -18,7 +18,7 @@ from ..nodes.raster.choose import check_style, make_rasterizer, resolve_rasteriz
 from ..nodes.raster.cpu import kernels_cached
 from ..nodes.raster.gl_context import require_gl
 from ..nodes.render import RenderNode, Wanted, load_drawn, load_points
-from ..nodes.sampling import Pools, SamplingNode
+from ..nodes.sampling import Pools, SamplingNode, check_point_budget
 from ..shared.camera import Camera
 from ..shared.colour import Colouring, colormap_words, parse_colour
 from ..shared.config import RunConfig
@@ -27,6 +27,7 @@ from ..shared.messages import RenderPoints
 from ..shared.octree import Octree
 from ..shared.store import Scene
 from ..shared.views import camera_views
+from .paging import check_paging
 from .sink import FrameSink, layer_name
 from .topologies import check_topology
 
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from ..nodes.layer_render import LayerRenderNode
     from ..nodes.layer_sampling import LayerSamplingNode
     from ..nodes.raster.group_raster import ResidentGroups
-    from ..nodes.raster.paged import PagedPoints, Paging, Residency
+    from ..nodes.raster.paged import PagedPoints, Residency
     from ..shared.layers.layer import Layer
 
 SPLAT_COLOUR = "#d0d0d0"
@@ -78,6 +79,9 @@ class Job:
         self.point_filter = PointFilter.choose(self.scene, config.filter.classes, config.filter.boxes)
         self.why_no_pools = self._why_no_pools()
         self.pools: Pools = "off" if self.why_no_pools else config.sampling.pools
+        if self.paged:
+            check_paging(config, info)
+        check_point_budget(config.sampling.point_budget, self.pixel_threshold, self.coded, self.pools)
         self.wanted = Wanted(
             splats=self.splats is not None,
             features=self.splats is not None and self.splats.features,
@@ -86,7 +90,6 @@ class Job:
             groups=self.coded,
             pools=self.pools != "off",
             point_filter=self.point_filter,
-            paging=self._paging() if self.paged else None,
         )
         self.wanted.check(self.scene)
         check_style(render.rasterizer, self.splats, groups=self.coded)
@@ -109,13 +112,6 @@ class Job:
             )
         if config.output.mp4 and not self.background[3]:
             raise ConfigError("render.background = 'transparent', expected a colour: a film (output.mp4) has no alpha")
-
-    def _paging(self) -> Paging:
-        from ..nodes.raster.paged import Paging
-        from .paging import check_paging
-
-        check_paging(self.config, self.scene.info)
-        return Paging(self.config.memory.budget_bytes, self.config.memory.complete)
 
     def _why_no_pools(self) -> str:
         """Why this run draws nothing from pools; empty if it may."""
@@ -181,6 +177,7 @@ class Job:
             whole_sets=self.coded,
             pools=self.pools,
             point_bytes=self.position_bytes + self.attribute_bytes,
+            point_budget=self.config.sampling.point_budget,
         )
 
     def _read_layers(self) -> list[Layer]:
@@ -224,9 +221,18 @@ class Job:
         """The points of this run, with what it needs of them; coded ones are decoded. Raises StoreError."""
         return load_points(self.scene, self.colouring, self.wanted, verify=verify)
 
-    def load_drawn(self, scene: Scene | None = None, *, verify: bool) -> ResidentPoints | ResidentGroups | PagedPoints:
+    def load_drawn(self, scene: Scene | None = None, *, verify: bool) -> ResidentPoints | ResidentGroups:
         """The points of this run, or of a share of its scene, in the form it draws them from. Raises StoreError."""
         return load_drawn(scene or self.scene, self.colouring, self.wanted, verify=verify)
+
+    def load_paged(self, scene: Scene | None = None) -> PagedPoints:
+        """The points of this run, or of a share of its scene, to be read by pages. Raises StoreError."""
+        from ..nodes.paged_points import load_paged
+        from ..nodes.raster.paged import Paging
+
+        memory = self.config.memory
+        paging = Paging(memory.budget_bytes, memory.complete)
+        return load_paged(scene or self.scene, self.colouring, self.point_filter, paging)
 
     def make_rasterizer(self, points: ResidentPoints | ResidentGroups | PagedPoints) -> Rasterizer:
         """The rasterizer of this run over ``points``; the caller closes it. Raises DeviceError."""
@@ -251,7 +257,7 @@ class Job:
         scene : a share of the run's, whose points are drawn.  shown : whether pictures are made of what is drawn.
         """
         progress("loading points", 0)
-        points = self.load_drawn(scene, verify=self.config.scene.verify)
+        points = self.load_paged(scene) if self.paged else self.load_drawn(scene, verify=self.config.scene.verify)
         output = self.config.output
         with ExitStack() as stack:
             rasterizer = stack.enter_context(self.make_rasterizer(points))

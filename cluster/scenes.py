@@ -32,18 +32,20 @@ def build_command(inputs: list[str], output: Path, settings: BuildSettings, json
     _build([open_source(path) for path in expand_inputs(inputs)], output, settings, json)
 
 
-def synth_command(output: Path, n_points: int, seed: int, settings: BuildSettings) -> None:
+def synth_command(
+    output: Path, n_points: int, seed: int, extent_m: float, settings: BuildSettings, json: Path | None
+) -> None:
     """``splatpipe synth``: a scene, or a file where the name ends in .las or .laz."""
     from ..shared.synth import CityScan, write_las
 
-    city = CityScan(n_points=n_points, seed=seed)
+    city = CityScan(n_points=n_points, seed=seed, extent_m=extent_m)
     if output.suffix.lower() in (".las", ".laz"):
         if output.exists() and not settings.overwrite:
             raise InputError(f"{output}: exists already; --overwrite replaces it")
         write_las(city, output)
         _console.print(f"wrote {output}: {n_points:,} points")
     else:
-        _build([city], output, settings, None)
+        _build([city], output, settings, json)
 
 
 def _build(sources: list[Any], output: Path, settings: BuildSettings, json: Path | None) -> None:

@@ -22,7 +22,7 @@ from .raster import Rasterizer, ResidentPoints
 
 if TYPE_CHECKING:
     from .raster.group_raster import ResidentGroups
-    from .raster.paged import PagedPoints, Paging, Residency
+    from .raster.paged import Residency
 
 
 class RenderNode:
@@ -69,7 +69,6 @@ class Wanted:
     cells : blocks as single cells.  spacing : the spacing of their points.  pools : the pooled forms of cells.
     groups : positions as linear groups (``grouped_cells``), not decoded.
     point_filter : which points are drawn at all; the others get NaN as their x.
-    paging : how points are held that stay on disk; None: they are resident.
     """
 
     splats: bool = False
@@ -79,7 +78,6 @@ class Wanted:
     pools: bool = False
     groups: bool = False
     point_filter: PointFilter = field(default_factory=PointFilter)
-    paging: Paging | None = None
 
     def check(self, scene: Scene) -> None:
         """Raise StoreError if the scene was built without what is wanted. Cost: none, it looks at no array."""
@@ -93,14 +91,8 @@ class Wanted:
             raise StoreError(f"{scene.path}: no pooled cells: build it with --pools")
 
 
-def load_drawn(
-    scene: Scene, colouring: Colouring, wanted: Wanted, *, verify: bool
-) -> ResidentPoints | ResidentGroups | PagedPoints:
-    """The render rank's half of a scene in the form that it is drawn from: ``load_points``, linear groups, or pages."""
-    if wanted.paging:
-        from .paged_points import load_paged
-
-        return load_paged(scene, colouring, wanted.point_filter, wanted.paging)
+def load_drawn(scene: Scene, colouring: Colouring, wanted: Wanted, *, verify: bool) -> ResidentPoints | ResidentGroups:
+    """The render rank's half of a scene in the form that it is drawn from: ``load_points``, or linear groups."""
     if not wanted.groups:
         return load_points(scene, colouring, wanted, verify=verify)
     from .grouped_cells import load_groups
