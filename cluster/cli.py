@@ -517,6 +517,30 @@ def bench_pipeline(
     _report(measure(config, sets or [], repeats), print_pipeline, json)
 
 
+@bench_app.command("paged")
+def bench_paged(
+    config: Annotated[Path, typer.Argument(help="Configuration of a run; its camera should move.")],
+    sets: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a key.")] = None,
+    budgets: Annotated[str, typer.Option(metavar="SIZE,SIZE,…", help="Values of memory.budget.")] = "250MB,500MB,1GB",
+    points: Annotated[str, typer.Option(metavar="M,M,…", help="Million points of sampling.point_budget.")] = "2,4,8",
+    error_frames: Annotated[int, typer.Option(help="Frames compared with complete ones.", min=1)] = 5,
+    json: JsonOption = None,
+) -> None:
+    """Points that stay on disk: error against run time for pools and budgets of points.
+
+    Example: `splatpipe bench paged configs/out-of-core.toml --budgets 500MB,1GB --json paged.json`
+    """
+    from .bench.paged import bench_paged as measure
+    from .bench.paged import print_paged
+
+    sizes = split_names(budgets) or ()
+    for size in sizes:
+        parse_bytes(size, "--budgets")
+    million = parse_numbers(points, "--points")
+    found = measure(config, sets or [], budgets=sizes, million_points=million, error_frames=error_frames)
+    _report(found, print_paged, json)
+
+
 @bench_app.command("lod")
 def bench_lod(
     points: Annotated[int, typer.Option(help="Number of points of each scene.", min=1000)] = 100_000_000,
