@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from ..nodes.layer_render import LayerRenderNode
     from ..nodes.layer_sampling import LayerSamplingNode
     from ..nodes.raster.group_raster import ResidentGroups
-    from ..nodes.raster.paged import PagedPoints, Residency
+    from ..nodes.raster.paged_points import PagedPoints, Residency
     from ..shared.layers.layer import Layer
 
 SPLAT_COLOUR = "#d0d0d0"
@@ -227,8 +227,8 @@ class Job:
 
     def load_paged(self, scene: Scene | None = None) -> PagedPoints:
         """The points of this run, or of a share of its scene, to be read by pages. Raises StoreError."""
-        from ..nodes.paged_points import load_paged
-        from ..nodes.raster.paged import Paging
+        from ..nodes.page_reader import load_paged
+        from ..nodes.raster.paged_points import Paging
 
         memory = self.config.memory
         paging = Paging(memory.budget_bytes, memory.complete)

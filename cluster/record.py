@@ -19,7 +19,7 @@ import numpy as np
 from ..shared.messages import RenderPoints, VisibilityBits
 
 if TYPE_CHECKING:
-    from ..nodes.raster.paged import Residency
+    from ..nodes.raster.paged_points import Residency
 
 RECORD_VERSION = 1
 

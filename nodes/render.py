@@ -22,7 +22,7 @@ from .raster import Rasterizer, ResidentPoints
 
 if TYPE_CHECKING:
     from .raster.group_raster import ResidentGroups
-    from .raster.paged import Residency
+    from .raster.paged_points import Residency
 
 
 class RenderNode:

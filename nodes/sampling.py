@@ -15,8 +15,9 @@ its grid is so fine that a bin is at most 1/√2 pixel wide, that is where the c
 The form has every bin that holds a point of the set, so it is never sparser than a part of the set seen on that grid.
 
 A frame may have a budget of points. One that would need more is cut with a share of the points a pixel, and a threshold
-that is larger by as much: the largest share of the ladder 2**(−k / ``SHARES_AN_OCTAVE``) that is found by galloping and
-bisection and keeps to the budget. It follows from the camera alone, so any rank, at any time, finds the same.
+that is larger by as much: a share of the ladder 2**(−k / ``SHARES_AN_OCTAVE``) that keeps to the budget while the next
+larger one does not, found by galloping and bisection. It follows from the camera alone, so any rank, at any time, finds
+the same.
 """
 
 from __future__ import annotations
@@ -62,6 +63,7 @@ class SamplingNode:
         less ``time`` (``POOLED_POINT_COST``). The octree needs their sizes.
     point_bytes : what drawing a point of a range reads.
     point_budget : most points of a frame; 0: no limit. Ranges only, and of thresholds above 0.
+    step : of the ladder of shares, of the last frame; 0: it was not thinned out.
     Raises ConfigError for a threshold that is not a finite number ≥ 0, points per pixel that are not one > 0, or an
     octree without pooled forms where they are to be drawn.
     """
@@ -85,6 +87,7 @@ class SamplingNode:
             raise ConfigError(f"sampling.pools = {pools!r}: the octree was loaded without pooled forms")
         check_point_budget(point_budget, pixel_threshold, whole_sets, pools)
         self.point_budget = point_budget
+        self.step = 0
         self.pixel_threshold = float(pixel_threshold)
         self.points_per_pixel = float(points_per_pixel)
         self.whole_sets = whole_sets
@@ -122,7 +125,7 @@ class SamplingNode:
 
         Raises MessageError if the bits belong to another frame or another octree.
         Cost: O(cells in the level-of-detail window) plus a scan of one word per cell. With a threshold of 0 no
-        projected size is computed. A frame above its budget is cut some ten times over. Pools add a look at each cell
+        projected size is computed. A frame above its budget is cut some six times over. Pools add a look at each cell
         that has a form, and nothing where they are off.
         """
         tree = self._octree
@@ -146,18 +149,29 @@ class SamplingNode:
 
     def _cut_to_budget(self, camera: Camera, bits: VisibilityBits) -> int:
         """Fill ``_n_drawn``; the size of the cut."""
+        self.step = 0
         n_cut, n_points = self._cut(camera, bits, 0)
         if not self.point_budget or n_points <= self.point_budget:
             return n_cut
-        too_many, enough = 0, 1
-        while self._cut(camera, bits, enough)[1] > self.point_budget and enough < _MOST_STEPS:
-            too_many, enough = enough, min(2 * enough, _MOST_STEPS)
+
+        def fits(step: int) -> bool:
+            return self._cut(camera, bits, step)[1] <= self.point_budget
+
+        # from where it would be if points were in proportion to the share
+        guess = min(math.ceil(SHARES_AN_OCTAVE * math.log2(n_points / self.point_budget)), _MOST_STEPS)
+        too_many, enough, stride = 0, guess, 1
+        if fits(guess):
+            while enough - stride > 0 and fits(enough - stride):
+                enough, stride = enough - stride, 2 * stride
+            too_many = max(enough - stride, 0)
+        else:
+            while not fits(min(enough + stride, _MOST_STEPS)) and enough + stride < _MOST_STEPS:
+                enough, stride = enough + stride, 2 * stride
+            too_many, enough = enough, min(enough + stride, _MOST_STEPS)
         while enough - too_many > 1:
-            step = (too_many + enough) // 2
-            if self._cut(camera, bits, step)[1] > self.point_budget:
-                too_many = step
-            else:
-                enough = step
+            middle = (too_many + enough) // 2
+            too_many, enough = (too_many, middle) if fits(middle) else (middle, enough)
+        self.step = enough
         return self._cut(camera, bits, enough)[0]
 
     def _cut(self, camera: Camera, bits: VisibilityBits, step: int) -> tuple[int, int]:

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from splatpipe.nodes.raster.page_pieces import PageCutter, SetTable
+from splatpipe.nodes.raster.page_pieces import PageCutter
 from splatpipe.nodes.raster.page_pool import PagePool
 from splatpipe.nodes.raster.paged import coarsest_pages
+from splatpipe.nodes.raster.paged_points import SetTable
 from splatpipe.shared.errors import InputError, MessageError, StoreError
 from splatpipe.shared.messages import RENDER_POINT
 

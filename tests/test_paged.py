@@ -12,11 +12,12 @@ from splatpipe.cluster.job import Job
 from splatpipe.cluster.launch import mpi_available
 from splatpipe.cluster.paging import check_paging, told_ahead
 from splatpipe.cluster.pipeline import run_single
-from splatpipe.nodes.paged_points import load_paged
+from splatpipe.nodes.page_reader import load_paged
 from splatpipe.nodes.point_filter import ClipBox, PointFilter
 from splatpipe.nodes.raster import PointSize
 from splatpipe.nodes.raster.cpu import CpuRasterizer
-from splatpipe.nodes.raster.paged import PagedCpuRasterizer, Paging
+from splatpipe.nodes.raster.paged import PagedCpuRasterizer
+from splatpipe.nodes.raster.paged_points import Paging
 from splatpipe.nodes.render import Wanted, load_points
 from splatpipe.shared.build import BuildSettings, build_scene
 from splatpipe.shared.colour import Colouring

@@ -176,8 +176,8 @@ def print_paged(results: dict[str, Any], console: Any) -> None:
             f"{psnr:.1f}",
         )
     console.print(table)
-    machine = results["machine"]
+    machine, compared = results["machine"], ", ".join(map(str, results["error_frames"]))
     console.print(
-        f"Holes, false pixels and PSNR: means of frames {', '.join(map(str, results['error_frames']))} against complete "
-        f"ones without a budget of points. {machine['cpu']}, {machine['cores']} cores"
+        f"Holes, false pixels and PSNR: means of frames {compared} against complete ones without a budget of points. "
+        f"{machine['cpu']}, {machine['cores']} cores"
     )

@@ -9,7 +9,7 @@ from . import PointSize, Rasterizer, ResidentPoints, SplatSettings
 
 if TYPE_CHECKING:
     from .group_raster import ResidentGroups
-    from .paged import PagedPoints
+    from .paged_points import PagedPoints
 
 RASTERIZERS = ("auto", "cpu", "gl", "gl-points")
 
@@ -37,9 +37,11 @@ def make_rasterizer(
     there.
     """
     if not isinstance(points, ResidentPoints):
-        from .paged import PagedCpuRasterizer, PagedPoints
+        from .paged_points import PagedPoints
 
         if isinstance(points, PagedPoints):
+            from .paged import PagedCpuRasterizer
+
             return PagedCpuRasterizer(points, width, height, size, threads)
         from .group_raster import CpuGroupRasterizer
 

@@ -14,20 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from .paged_points import SetTable
 from .pieces import PIECE, check_entries
-
-
-class SetTable(NamedTuple):
-    """The sets of a scene's cells, in stored order, without gaps: what a fallback needs of the octree.
-
-    first : (c + 1,) int64, first point of each set, and their end.
-    parent : (c,) int32, set of the parent of each cell, −1 where it has none.
-    level : (c,) uint8, of the cell.
-    """
-
-    first: np.ndarray
-    parent: np.ndarray
-    level: np.ndarray
 
 
 class PagedPieces(NamedTuple):

@@ -9,21 +9,19 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Self
 
 import numpy as np
 
 from ...shared.errors import InputError
+from .paged_points import ReadPoints
 
 ABSENT, LOADING = -1, -2
 """What ``PagePool.slot_of_page`` says of a page that is in no slot (yet)."""
 
 LOADERS = 4
 """Threads that read pages: while some wait for the disk, others copy."""
-
-ReadPoints = Callable[[int, np.ndarray, np.ndarray, np.ndarray, np.ndarray | None], None]
-"""Fills x, y, z (float32) and colour words (uint32; None: not wanted) with the stored points from a first one on."""
 
 
 class PagePool:

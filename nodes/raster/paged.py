@@ -8,7 +8,6 @@ scene either way.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -18,56 +17,13 @@ from . import PointSize, kernels
 from .blocks import Blocks
 from .cpu import PIECE_POINTS
 from .framebuffers import FramebufferRasterizer
-from .page_pieces import PageCutter, PagedPieces, SetTable
-from .page_pool import PagePool, ReadPoints, n_slots_of
+from .page_pieces import PageCutter, PagedPieces
+from .page_pool import PagePool, n_slots_of
+from .paged_points import PagedPoints, Residency, SetTable
 from .threads import read_only
-
-PAGE_POINTS = 1 << 14
-"""Points of a page: some neighbouring cells of one level."""
 
 PINNED_SHARE = 1 / 4
 """Most of the pool that the coarsest levels take, which stay in it to be drawn where finer cells are missing."""
-
-
-@dataclass(frozen=True)
-class Paging:
-    """How points are held. budget_bytes : of the pool.  complete : frames wait for their points."""
-
-    budget_bytes: int
-    complete: bool = False
-    page_points: int = PAGE_POINTS
-
-
-@dataclass(frozen=True)
-class PagedPoints:
-    """The render rank's half of a scene that stays on disk; what it has in common with ``ResidentPoints`` is as there.
-
-    read : reads points and colours them.  one_colour : the colour word of all of them; None: they differ.
-    sets : of the scene's cells.
-    """
-
-    n_points: int
-    read: ReadPoints
-    one_colour: np.uint32 | None
-    block_first_point: np.ndarray
-    block_origin: np.ndarray
-    sets: SetTable
-    paging: Paging
-
-    def __len__(self) -> int:
-        return self.n_points
-
-
-@dataclass(frozen=True)
-class Residency:
-    """What the last frame found. missing : share of its points that were not there, 0 … 1.
-
-    loaded_bytes, evicted_pages : read into the pool and dropped from it since the frame before.
-    """
-
-    missing: float
-    loaded_bytes: int
-    evicted_pages: int
 
 
 class PagedCpuRasterizer(FramebufferRasterizer):

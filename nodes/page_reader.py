@@ -9,9 +9,7 @@ from ..shared.errors import StoreError
 from ..shared.octree import Octree
 from ..shared.store import Scene
 from .point_filter import PointFilter
-from .raster.page_pieces import SetTable
-from .raster.page_pool import ReadPoints
-from .raster.paged import PagedPoints, Paging
+from .raster.paged_points import PagedPoints, Paging, ReadPoints, SetTable
 
 
 def load_paged(scene: Scene, colouring: Colouring, point_filter: PointFilter, paging: Paging) -> PagedPoints:
