@@ -2,14 +2,19 @@
 
 =======================  ==============================================================
 cli                      the command line: one function a command
-run, job, pipeline       a run: made ready, and its frame loop on one rank or three
-topologies               which there are, how many ranks they take, what they refuse
-frame_parallel           each rank draws whole pictures
-sort_last, compositing/  each rank draws a share of the points; framebuffers meet
-transport, launch        messages between ranks; starting ranks, and who died
+run, job                 a run, made ready
+layout, topologies       which rank culls, samples and draws what; what a topology refuses
+pipeline, selection      the frame loop of a rank; its part of the octree
+compositing/             framebuffers of tiles and shares meet
+frame_parallel, film     each rank draws whole pictures; one film of them
+wall                     each rank draws and writes a screen of a display wall
+transport                messages between ranks; MPI is nowhere else
+compression              when messages are coded: measured links, trials
+launch, watch            starting ranks; who died, stopped or fell silent
+resume, survival         going on with a run cut short, or without a rank that died
 delivery                 a scene's arrays sent to the render rank
 sink, progress, record   outputs; progress bars; what a run says about itself
-scenes                   build, synth, info, verify
+scenes, build_ranks      build, synth, info, verify; building on several ranks
 layers/                  layer: files → layers of objects
 plan/                    what a run needs and what it leaves out; one rank or three
 model/                   the parameters and inequalities of the thesis

@@ -34,6 +34,7 @@ app.add_typer(layer_app, name="layer")
 CellInputs = Annotated[
     list[str] | None, typer.Argument(help="Scenes, point files, folders or globs; default: a generated surface.")
 ]
+RanksOption = Annotated[int, typer.Option(help="Build on so many MPI ranks, started here; 0: without MPI.", min=0)]
 JsonOption = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write what was measured.")]
 
 
@@ -54,6 +55,9 @@ def run(
     complete: Annotated[
         bool, typer.Option("--complete", help="Paged points: wait for all of a frame; sets memory.complete.")
     ] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with a run that was cut short: draw only what is missing.")
+    ] = False,
     json: JsonOption = None,
 ) -> None:
     """Draw a camera path: PNG frames, a film, and run.json with where the time went.
@@ -64,7 +68,8 @@ def run(
     """
     from .run import run_command
 
-    raise typer.Exit(run_command(config, [*(sets or []), *["memory.complete=true"] * complete], json))
+    overridden = [*["memory.complete=true"] * complete, *["output.resume=true"] * resume]
+    raise typer.Exit(run_command(config, [*(sets or []), *overridden], json))
 
 
 @app.command()
@@ -98,9 +103,12 @@ def build(
     n_pools: Annotated[int, typer.Option(help="Pools: most of a cell.")] = 2,
     strict: Annotated[bool, typer.Option(help="Refuse points that are not finite instead of dropping them.")] = False,
     overwrite: Annotated[bool, typer.Option(help="Replace an existing scene.")] = False,
+    ranks: RanksOption = 0,
     json: JsonOption = None,
 ) -> None:
     """Build a scene from point files, larger than memory if need be.
+
+    `mpirun -n N splatpipe build …` shares the work among ranks that see the same folders; so does `--ranks N`.
 
     Example: `splatpipe build 'survey/*.laz' -o survey.scene --memory 8GB`
     """
@@ -128,7 +136,7 @@ def build(
         strict=strict,
         overwrite=overwrite,
     )
-    build_command(inputs, output, settings, json)
+    raise typer.Exit(build_command(inputs, output, settings, json, ranks))
 
 
 @app.command()
@@ -143,6 +151,7 @@ def synth(
     memory: Annotated[str, typer.Option(help="As for `splatpipe build`.")] = "",
     attributes: Annotated[str, typer.Option(help="As for `splatpipe build`.")] = "",
     overwrite: Annotated[bool, typer.Option(help="Replace an existing scene.")] = False,
+    ranks: RanksOption = 0,
     json: JsonOption = None,
 ) -> None:
     """Make a synthetic city scan: a scene directory, or a LAS/LAZ file.
@@ -163,7 +172,7 @@ def synth(
         memory_bytes=parse_bytes(memory, "--memory") if memory else None,
         attributes=split_names(attributes),
     )
-    synth_command(output, points, seed, extent, settings, json)
+    raise typer.Exit(synth_command(output, points, seed, extent, settings, json, ranks))
 
 
 @app.command()
@@ -487,17 +496,18 @@ def bench_budget(
 def bench_build(
     points: Annotated[int, typer.Option(help="Number of points of the LAS file.", min=1000)] = 20_000_000,
     repeats: Annotated[int, typer.Option(help="Timed builds.", min=1)] = 3,
+    ranks: Annotated[int, typer.Option(help="Also on so many MPI ranks of this host; 0: not.", min=0)] = 0,
     workdir: Annotated[Path | None, typer.Option(help="Where the file and the scenes go.")] = None,
     json: JsonOption = None,
 ) -> None:
-    """LAS file → scene: points per second and peak memory, in memory and external.
+    """LAS file → scene: points per second and peak memory, in memory, external and on MPI ranks.
 
-    Example: `splatpipe bench build --points 20000000 --json build.json`
+    Example: `splatpipe bench build --points 20000000 --ranks 2 --json build.json`
     """
     from .bench.build import bench_build as measure
     from .bench.build import print_build
 
-    _report(measure(n_points=points, repeats=repeats, workdir=workdir), print_build, json)
+    _report(measure(n_points=points, repeats=repeats, ranks=ranks, workdir=workdir), print_build, json)
 
 
 @bench_app.command("pipeline")
@@ -539,6 +549,94 @@ def bench_paged(
     million = parse_numbers(points, "--points")
     found = measure(config, sets or [], budgets=sizes, million_points=million, error_frames=error_frames)
     _report(found, print_paged, json)
+
+
+@bench_app.command("balance")
+def bench_balance(
+    topology: Annotated[str, typer.Option(help="One that has something to move.")] = "sort-first-only",
+    ranks: Annotated[int, typer.Option(help="Number of ranks.", min=2)] = 2,
+    sets: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a key.")] = None,
+    points: Annotated[int, typer.Option(help="Number of points.", min=1000)] = 4_000_000,
+    share: Annotated[float, typer.Option(help="Share of them in one octant.", min=0, max=1)] = 0.9,
+    size: Annotated[str, typer.Option(metavar="WIDTHxHEIGHT", help="Viewport, pixels.")] = "1280x720",
+    frames: Annotated[int, typer.Option(help="Frames of the round that the camera makes.", min=1)] = 240,
+    repeats: Annotated[int, typer.Option(help="Runs of each.", min=1)] = 3,
+    workdir: Annotated[Path, typer.Option(help="Where the scene is built and kept.")] = Path("bench-balance"),
+    json: JsonOption = None,
+) -> None:
+    """Load balance off against measured, on a scene with one hot octant and a moving camera.
+
+    Example: `splatpipe bench balance --ranks 4 --points 1000000 --json balance.json`
+    """
+    from .bench.balance import bench_balance as measure
+    from .bench.balance import print_balance
+
+    width, height = map(int, parse_numbers(size.replace("x", ","), "--size", 2))
+    results = measure(
+        topology,
+        ranks,
+        sets or [],
+        n_points=points,
+        share=share,
+        width=width,
+        height=height,
+        frames=frames,
+        repeats=repeats,
+        workdir=workdir,
+    )
+    _report(results, print_balance, json)
+
+
+@bench_app.command("compositing")
+def bench_compositing(
+    ranks: Annotated[str, typer.Option(metavar="N,N,…", help="Numbers of ranks, each at least 2.")] = "2,4",
+    sizes: Annotated[str, typer.Option(metavar="WIDTHxHEIGHT,…", help="Pictures, pixels.")] = "1280x720",
+    coverages: Annotated[str, typer.Option(metavar="%,%,…", help="Pixels that a rank has drawn on.")] = "10,50",
+    policies: Annotated[str, typer.Option(metavar="NAME,…", help="Of pipeline.compositing; all of them.")] = "",
+    empty: Annotated[float, typer.Option(help="Ranks that have drawn nothing, %.", min=0, max=99)] = 0,
+    radix: Annotated[int, typer.Option(help="Of radix-k.", min=2, max=1024)] = 8,
+    frames: Annotated[int, typer.Option(help="Timed frames of each policy.", min=1)] = 15,
+    plot: Annotated[Path | None, typer.Option(help="PNG file: measured and model, and the model by ranks.")] = None,
+    json: JsonOption = None,
+) -> None:
+    """Policies of sort-last compositing on ranks started here, beside the model and radix-k's published figure.
+
+    Exit status 1 if one policy's picture has other bits than another's.
+
+    Example: `splatpipe bench compositing --ranks 2,3,4 --sizes 1280x720,1920x1080 --json compositing.json`
+    """
+    from .bench.compositing import bench_compositing as measure
+    from .bench.compositing import parse_cases, plot_compositing, print_compositing
+
+    cases = parse_cases(ranks, sizes, parse_numbers(coverages, "--coverages"), policies)
+    found = measure(**cases, radix=radix, frames=frames, empty=empty / 100)
+    if plot is not None:
+        plot_compositing(found, plot)
+    _report(found, print_compositing, json)
+    raise typer.Exit(int(not all(row["same_bits"] for row in found["rows"])))
+
+
+@bench_app.command("messages")
+def bench_messages(
+    inputs: Annotated[list[Path], typer.Argument(help="Configurations of runs, or scenes.")],
+    sets: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a key.")] = None,
+    frames: Annotated[int, typer.Option(help="Frames of each, spread over the camera path.", min=1)] = 5,
+    ranks: Annotated[int, typer.Option(help="Framebuffers also of one of so many shares.", min=1)] = 4,
+    repeats: Annotated[int, typer.Option(help="Times that each is measured.", min=1)] = 5,
+    json: JsonOption = None,
+) -> None:
+    """Coded messages: bytes, encode, decode, and the bandwidth below which coding pays.
+
+    Exit status 1 if what is decoded is not what was coded.
+
+    Example: `splatpipe bench messages configs/demo.toml survey.scene --json messages.json`
+    """
+    from .bench.messages import bench_messages as measure
+    from .bench.messages import print_messages
+
+    results = measure(inputs, sets or [], frames=frames, ranks=ranks, repeats=repeats)
+    _report(results, print_messages, json)
+    raise typer.Exit(int(any(row["failed"] for row in results["rows"])))
 
 
 @bench_app.command("lod")

@@ -36,7 +36,7 @@ ASKED_AHEAD = 3
 
 
 def serve_scene(scene: Scene, colour: str, transport: Transport, rank: int) -> None:
-    """Offer a scene to a rank and send it what it asks for, until it needs no more; no time limit.
+    """Offer a scene to a rank and send it what it asks for, until it needs no more.
 
     colour : the run's colour mode, settled.  Raises MessageError for a request of what the scene has not.
     """

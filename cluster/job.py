@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,8 +28,9 @@ from ..shared.messages import RenderPoints
 from ..shared.octree import Octree
 from ..shared.store import Scene
 from ..shared.views import camera_views
+from ..shared.wall import Screen, wall_of
 from .paging import check_paging
-from .sink import FrameSink, layer_name
+from .sink import Film, FrameSink, H264Film, layer_name
 from .topologies import check_topology
 
 if TYPE_CHECKING:
@@ -48,6 +50,7 @@ class Job:
     Frames are what the pipeline draws, views of pictures: ``n_frames`` of ``views.width`` × ``views.height`` pixels,
     ``views.per_picture`` to a picture. Sizes of points are in drawn pixels, so that they do not depend on
     ``render.supersampling`` in the picture. ``threads`` is for whoever shares the cores with other ranks to lower.
+    ``frames`` are those to draw, views of whole pictures, ascending: all, unless ``draw_only`` says otherwise.
 
     scene : the one to draw; default: that of ``scene.path``, or one without points where there are only layers.
     """
@@ -102,16 +105,52 @@ class Job:
         self.colour = self.colouring.mode if render.colour == "auto" else render.colour
         if self.splats and self.splats.lighting and self.colouring.mode == "normal":  # light falls on a splat once
             self.colouring = Colouring.choose(self.scene, SPLAT_COLOUR)
-        self.views = camera_views(config.camera, info, self.n_pictures, render.supersampling)
+        self.wall = wall_of(config)
+        camera = config.camera  # of all screens together
+        if self.wall:
+            camera = camera.model_copy(update={"width": self.wall.width, "height": self.wall.height})
+        self._panel_px = camera.width, camera.height
+        self._check_sides()
+        self.views = camera_views(camera, info, self.n_pictures, render.supersampling)
         self.n_frames = self.n_pictures * self.views.per_picture
-        largest_px = render.supersampling * max(config.camera.width, config.camera.height)
-        if largest_px > MAX_SIDE_PX:
-            raise ConfigError(
-                f"render.supersampling = {render.supersampling}: {largest_px} px a side are to be drawn, "
-                f"expected at most {MAX_SIDE_PX}"
-            )
+        self.frames: Sequence[int] = range(self.n_frames)  # to be drawn: all views of some pictures
+        self.make_film: Callable[[Path, float], Film] = H264Film  # for whoever has not all pictures to replace
         if config.output.mp4 and not self.background[3]:
             raise ConfigError("render.background = 'transparent', expected a colour: a film (output.mp4) has no alpha")
+        if self.film_afterwards and not config.output.png:
+            raise ConfigError("output.resume = true: a film is then made of the PNG files, expected output.png = true")
+
+    def draw_only(self, pictures: Sequence[int]) -> None:
+        """Draw these pictures, ascending, and no others."""
+        views = self.views.per_picture
+        self.frames = [picture * views + view for picture in pictures for view in range(views)]
+
+    @property
+    def pictures(self) -> list[int]:
+        """Numbers of the pictures to draw."""
+        views = self.views.per_picture
+        return [frame // views for frame in self.frames[::views]]
+
+    @property
+    def film_afterwards(self) -> bool:
+        """Whether the film is made of the pictures on disk at the end: no run that is resumed has them all in order."""
+        return self.config.output.mp4 and self.config.output.resume
+
+    def _check_sides(self) -> None:
+        supersampling, sides = self.config.render.supersampling, self._panel_px
+        if max(sides) * supersampling <= MAX_SIDE_PX:
+            return
+        if self.wall and max(sides) > MAX_SIDE_PX:
+            i = sides.index(max(sides))
+            key = ("columns", "rows")[i]
+            raise ConfigError(
+                f"wall.{key} = {getattr(self.wall, key)}: the screens and mullions are {sides[i]} px together, "
+                f"expected at most {MAX_SIDE_PX}"
+            )
+        raise ConfigError(
+            f"render.supersampling = {supersampling}: {supersampling * max(sides)} px a side are to be drawn, "
+            f"expected at most {MAX_SIDE_PX}"
+        )
 
     def _why_no_pools(self) -> str:
         """Why this run draws nothing from pools; empty if it may."""
@@ -160,11 +199,15 @@ class Job:
 
     def culling_node(self, octree: Octree) -> CullingNode:
         """The culling node of this run."""
-        margin_px = self.largest_point_px / 2 + 0.5  # a point just outside reaches in; and rounding moves it
-        return CullingNode(octree, backface=self.backface, margin_px=margin_px, point_filter=self.point_filter)
+        return CullingNode(octree, backface=self.backface, margin_px=self._margin_px, point_filter=self.point_filter)
 
-    def sampling_node(self, octree: Octree) -> SamplingNode:
-        """The sampling node of this run.
+    @property
+    def _margin_px(self) -> float:
+        """A point so far outside reaches in; and rounding moves it."""
+        return self.largest_point_px / 2 + 0.5
+
+    def sampling_node(self, octree: Octree, own: np.ndarray | None = None) -> SamplingNode:
+        """The sampling node of this run, or of a part of its octree that answers for the cells ``own``.
 
         Its threshold is in pixels of the picture; how many points cover a cell is counted in drawn pixels, so that each
         of those that are averaged has points of its own.
@@ -178,6 +221,8 @@ class Job:
             pools=self.pools,
             point_bytes=self.position_bytes + self.attribute_bytes,
             point_budget=self.config.sampling.point_budget,
+            own=own,
+            margin_px=self._margin_px,
         )
 
     def _read_layers(self) -> list[Layer]:
@@ -250,11 +295,17 @@ class Job:
 
     @contextmanager
     def open_render(
-        self, progress: Callable[[str, int], None], scene: Scene | None = None, *, shown: bool = True
+        self,
+        progress: Callable[[str, int], None],
+        scene: Scene | None = None,
+        *,
+        shown: bool = True,
+        screen: Screen | None = None,
     ) -> Iterator[RenderStage]:
         """The render node of this run with its points loaded, its kernels compiled and its output open.
 
-        scene : a share of the run's, whose points are drawn.  shown : whether pictures are made of what is drawn.
+        scene : a share of the run's, whose points are drawn.  shown : whether pictures are made of what is drawn, and
+        layers drawn over it.  screen : of a wall, where no more is shown.
         """
         progress("loading points", 0)
         points = self.load_paged(scene) if self.paged else self.load_drawn(scene, verify=self.config.scene.verify)
@@ -269,16 +320,33 @@ class Job:
                 progress("compiling kernels (once; kept for the next run)", 0)
             node.warm_up(self.camera(0))
             layers = None
-            if self.layers:
+            if self.layers and shown:
                 progress("loading layers", 0)
                 layers = stack.enter_context(self._open_layers())
                 layers.warm_up(self.camera(0))
             composer = sink = None
+            mp4 = output.mp4 and not self.film_afterwards
             if shown and (output.png or output.mp4 or output.depth or output.normals):
-                composer = stack.enter_context(Composer(self.picture_settings))
+                settings = replace(self.picture_settings, screen=screen.window if screen else None)
+                composer = stack.enter_context(Composer(settings))
                 composer.warm_up([self.camera(view) for view in range(self.views.per_picture)])
-                sink = stack.enter_context(FrameSink(self.output, png=output.png, mp4=output.mp4, fps=output.fps))
-            yield RenderStage(node, layers, composer, sink, self.views.per_picture, self.frames_ahead)
+                sink = stack.enter_context(
+                    FrameSink(self.output, png=output.png, mp4=mp4, fps=output.fps, make_film=self.make_film)
+                )
+            yield RenderStage(
+                node, layers, composer, sink, self.views.per_picture, self._seen(screen), self.frames_ahead
+            )
+
+    def _seen(self, screen: Screen | None) -> Callable[[Picture], list[tuple[str, Picture]]]:
+        """What is written of a picture: names of screens, and what they show; the name of a whole picture is empty."""
+        wall = self.wall
+        if wall is None:
+            return lambda picture: [("", picture)]
+        if screen is not None:
+            return lambda picture: [(screen.name, picture)]
+        from ..nodes.picture.wall import seen
+
+        return lambda picture: seen(picture, wall)
 
     @contextmanager
     def _open_layers(self) -> Iterator[LayerRenderNode]:
@@ -295,8 +363,8 @@ class Job:
         return PictureSettings(
             view=camera.view,
             layout=camera.stereo_layout,
-            width=camera.width,
-            height=camera.height,
+            width=self._panel_px[0],
+            height=self._panel_px[1],
             supersampling=render.supersampling,
             background=self.background,
             bits=output.png_bits,
@@ -311,10 +379,24 @@ class Job:
     @property
     def composed_share(self) -> float:
         """Pixels of a picture over the pixels drawn for it."""
-        camera = self.config.camera
-        panels = 2 if camera.view == "stereo" else 1
+        panels = 2 if self.config.camera.view == "stereo" else 1
         drawn = self.views.per_picture * self.views.width * self.views.height
-        return panels * camera.width * camera.height / drawn
+        return panels * self._panel_px[0] * self._panel_px[1] / drawn
+
+    @property
+    def picture_size(self) -> tuple[int, int]:
+        """Width and height of a picture as it is written, or of what a screen shows of it; pixels."""
+        if self.wall:
+            return self.wall.file_size
+        camera = self.config.camera
+        across = 2 if camera.view == "stereo" and camera.stereo_layout == "side-by-side" else 1
+        down = 2 if camera.view == "stereo" and camera.stereo_layout == "over-under" else 1
+        return across * camera.width, down * camera.height
+
+    def picture_names(self, layer: str, number: int) -> list[str]:
+        """Names of the files of a layer of a picture."""
+        screens = self.wall.screens if self.wall and self.wall.apart else []
+        return [layer_name(layer, number, screen.name) for screen in screens] or [layer_name(layer, number)]
 
     @property
     def attributes_read(self) -> set[str]:
@@ -331,9 +413,9 @@ class Job:
         """What the run has written, for people."""
         output, said = self.config.output, []
         for layer in [name for name in ("png", "depth", "normals") if getattr(output, name)]:
-            last = layer_name(layer, self.n_pictures - 1)
-            first = str(self.output / layer_name(layer, 0))
-            said.append(f"{first} … {last}" if self.n_pictures > 1 else first)
+            last = self.picture_names(layer, self.n_pictures - 1)[-1]
+            first = self.picture_names(layer, 0)[0]
+            said.append(str(self.output / first) + (f" … {last}" if last != first else ""))
         if output.mp4:
             said.append(str(self.output / "film.mp4"))
         return [*said, str(self.output / "run.json")]
@@ -349,6 +431,7 @@ class RenderStage:
         composer: Composer | None,
         sink: FrameSink | None,
         per_picture: int,
+        seen: Callable[[Picture], list[tuple[str, Picture]]],
         frames_ahead: int = 0,
     ) -> None:
         self._node = node
@@ -357,18 +440,12 @@ class RenderStage:
         self._sink = sink
         self._per_picture = per_picture
         self.frames_ahead = frames_ahead
+        self._seen = seen
         self.description = " + ".join(part.description for part in (node, layers) if part)
 
-    def draw(self, camera: Camera, chosen: RenderPoints, of_layers: Sequence[RenderPoints] = ()) -> Picture | None:
-        """Draw a frame; the picture that it completes, None before its last view or where nobody wants it."""
-        return self.compose(camera, self.rasterize(camera, chosen, of_layers))
-
-    def rasterize(self, camera: Camera, chosen: RenderPoints, of_layers: Sequence[RenderPoints] = ()) -> np.ndarray:
-        """(height, width) uint64 framebuffer words of a frame; valid until the next call."""
-        words = self._node.process(camera, chosen)
-        if self._layers is not None:
-            words = self._layers.process(camera, of_layers, words)
-        return words
+    def rasterize(self, camera: Camera, chosen: RenderPoints) -> np.ndarray:
+        """(height, width) uint64 framebuffer words of a frame's points; valid until the next call."""
+        return self._node.process(camera, chosen)
 
     def expect(self, chosen: RenderPoints) -> None:
         """Say what a frame that follows will draw; asked for up to ``frames_ahead`` frames, in order."""
@@ -379,8 +456,12 @@ class RenderStage:
         """What the last frame found of paged points; None where points are resident."""
         return self._node.residency
 
-    def compose(self, camera: Camera, words: np.ndarray) -> Picture | None:
-        """The picture that the words of a frame complete, as of ``draw``."""
+    def compose(self, camera: Camera, words: np.ndarray, of_layers: Sequence[RenderPoints] = ()) -> Picture | None:
+        """The picture that a frame completes, its layers drawn over the words of its points; None before its last view
+        or where nobody wants it.
+        """
+        if self._layers is not None:
+            words = self._layers.process(camera, of_layers, words)
         if self._composer is None:
             return None
         return self._composer.add(camera.frame % self._per_picture, camera, words)
@@ -388,7 +469,8 @@ class RenderStage:
     def show(self, frame: int, picture: Picture | None) -> None:
         """Hand the picture to the output; waits while that is behind."""
         if self._sink is not None and picture is not None:
-            self._sink.put(frame // self._per_picture, picture)
+            for screen, part in self._seen(picture):
+                self._sink.put(frame // self._per_picture, part, screen)
 
     def times(self) -> dict[str, list[float]]:
         """Seconds of encoding, picture by picture, by kind of output; complete once the output is closed."""

@@ -1,38 +1,57 @@
-"""The frame loop: culling → sampling → render, on one rank or on three.
+"""The frame loop: culling → sampling → render → display, on the ranks of a layout.
 
-On three ranks frame *i* is drawn while *i + 1* is sampled and *i + 2* culled (thesis 5.2). The coordinator, which is
-also the culling rank, starts a frame only while fewer than ``frames_in_flight`` are unfinished, so nothing piles up.
-Each rank opens only its half of the scene: the selection ranks never load a point, the render rank no octree. Where
-the scene is delivered by messages, the sampling rank reads the render rank's half for it and sends it (``delivery``).
+Every rank goes through the frames in order and does its stages of each; what a stage makes for another rank is sent,
+what it makes for this one is handed on. On three ranks frame *i* is drawn while *i + 1* is sampled and *i + 2* culled
+(thesis 5.2). The coordinator, rank 0, starts a frame only while fewer than ``frames_in_flight`` are unfinished, so
+nothing piles up. Each rank opens only its half of the scene: the selection ranks never load a point, the render rank
+no octree unless it has a share of the points. Where the scene is delivered by messages, the sampling rank reads the
+render rank's half for it and sends it (``delivery``).
 """
 
 from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from ..shared.camera import Camera
 from ..shared.config import RunConfig
 from ..shared.messages import (
+    FRAME_START_BYTES,
     RENDER_POINT,
+    FrameStart,
     Kind,
+    Message,
     RenderPoints,
-    decode_camera,
+    VisibilityBits,
+    decode_frame_start,
     decode_render_points,
     decode_visibility,
 )
+from ..shared.scene_share import SceneShare
+from .balance import can_balance, is_on
+from .compositing import make_compositor
+from .compositing.tiles import Tiles
 from .delivery import receive_scene, serve_scene
-from .job import Job
-from .paging import told_ahead
-from .record import FrameCounts, StageClock, rank_record, spread_ms
-from .topologies import PIPELINE_ROLES as ROLES
+from .job import Job, RenderStage
+from .layout import ALONE, Layout, Plan
+from .record import FrameCounts, StageClock, rank_record, spread_ms, summed_traffic, with_missing
+from .selection import CullingPart, LaneCells, SamplingPart, first_plan, merged_entries, shares_of, with_borders
 from .transport import Transport
+from .wall import screen_windows, writes_screens
 
+if TYPE_CHECKING:
+    from .balance.balancer import Balancer
+    from .balance.times import StageTimes, TimesTeller
+
+STAGES = ("culling", "sampling", "render", "compositing", "picture")
 CULLING, SAMPLING, RENDER = range(3)
-_MAX_CAMERA_BYTES = 1 << 10
+"""Ranks of a chain of three, where a scene is delivered by messages."""
 
 Progress = Callable[[str, int], None]
 """Called with what is going on and how many frames are done."""
@@ -40,9 +59,10 @@ Progress = Callable[[str, int], None]
 
 @dataclass(frozen=True)
 class Drawn:
-    """What a rank that does everything itself has to say of its frames.
+    """What a rank has to say of its frames.
 
-    clocks : of culling, sampling and render.  times : of encoding, by kind of output.
+    clocks : of its stages.  times : of encoding, by kind of output.  held : what its record says beside the rest.
+    latency_s : on the coordinator, of each frame.
     started, drawn : when the first frame began and the last one was drawn (``time.perf_counter``).
     """
 
@@ -50,6 +70,8 @@ class Drawn:
     counts: FrameCounts
     times: dict[str, list[float]]
     rasterizer: str
+    held: dict[str, Any]
+    latency_s: list[float]
     loading_s: float
     started: float
     drawn: float
@@ -59,8 +81,10 @@ class Drawn:
         return {
             "rasterizer": self.rasterizer,
             "stages": {clock.stage: clock.summary() for clock in self.clocks},
-            "latency_ms": spread_ms([sum(t) for t in zip(*(clock.work_s for clock in self.clocks), strict=True)]),
-            "per_frame": {f"{clock.stage}_s": clock.work_s for clock in self.clocks} | self.counts.lists() | self.times,
+            "latency_ms": spread_ms(self.latency_s),
+            "per_frame": with_missing(
+                {f"{clock.stage}_s": clock.work_s for clock in self.clocks} | self.counts.lists() | self.times
+            ),
             "loading_s": self.loading_s,
             "rendered_s": self.drawn - self.started,
             "finished_s": time.perf_counter() - self.started,
@@ -68,120 +92,32 @@ class Drawn:
 
 
 def run_single(job: Job, progress: Progress) -> dict[str, Any]:
-    """All three nodes in this process, frame after frame; the statistics of the run. Imports no MPI."""
-    drawn = draw_alone(job, range(job.n_frames), progress, lambda: None)
+    """All stages in this process, frame after frame; the statistics of the run. Imports no MPI."""
+    drawn = FrameLoop(job, ALONE, None, progress).run()
     return drawn.record() | {"ranks": [rank_record("single", 0)], "messages": {}}
 
 
-def draw_alone(job: Job, frames: Sequence[int], progress: Progress, ready: Callable[[], None]) -> Drawn:
-    """Draw frames, views of whole pictures, with all three nodes in this process, and write the pictures.
+def run_layout(job: Job, layout: Layout, transport: Transport, progress: Progress) -> dict[str, Any] | None:
+    """Do this rank's part of a layout; the statistics of the run on rank 0, None elsewhere. Collective."""
+    loop = FrameLoop(job, layout, transport, progress)
+    drawn = loop.run()
+    told = _told(layout, drawn, transport)
+    screens = bool(screen_windows(job, layout))
+    if can_balance(layout, screens):
+        told |= {"taken_s": loop.taken_s(), "adopting_s": loop.adopting_s}
+    result = None
+    if transport.rank == 0:
+        others = [rank for rank in layout.workers if rank]
+        all_told = [told, *(transport.receive_note(rank, Kind.STATISTICS)[1] for rank in others)]
+        result = _merged(drawn, all_told)
+        if can_balance(layout, screens) and len(job.frames):
+            from .balance.summary import balance_record
 
-    ready : called when all is loaded, before the first frame.
-    """
-    loading = time.perf_counter()
-    clocks = [StageClock(role) for role in ROLES]
-    counts = FrameCounts()
-    octree = job.load_octree()
-    culling, sampling = job.culling_node(octree), job.sampling_node(octree)
-    layers = job.layer_nodes()
-    sampling.process(job.camera(0), culling.process(job.camera(0)))  # compiles, or loads what was compiled
-    with job.open_render(progress) as render:
-        ready()
-        started = time.perf_counter()
-        loading_s = started - loading
-
-        def select(frame: int) -> tuple[Camera, RenderPoints, list[RenderPoints]]:
-            camera = job.camera(frame)
-            with clocks[CULLING].working():
-                bits = culling.process(camera)
-                bits_of_layers = [layer_culling.process(camera) for layer_culling, _ in layers]
-            with clocks[SAMPLING].working():
-                chosen = sampling.process(camera, bits)
-                of_layers = [node.process(camera, seen) for (_, node), seen in zip(layers, bits_of_layers, strict=True)]
-            counts.add(bits, chosen)
-            return camera, chosen, of_layers
-
-        selected = told_ahead(map(select, frames), render.frames_ahead, lambda frame: render.expect(frame[1]))
-        for done, (camera, chosen, of_layers) in enumerate(selected, 1):
-            with clocks[RENDER].working():
-                picture = render.draw(camera, chosen, of_layers)
-            with clocks[RENDER].waiting():
-                render.show(camera.frame, picture)
-            counts.add_layers(of_layers)
-            counts.add_residency(render.residency)
-            progress("rendering", done)
-        drawn = time.perf_counter()
-    return Drawn(clocks, counts, render.times(), render.description, loading_s, started, drawn)
-
-
-def run_pipelined(job: Job, transport: Transport, progress: Progress) -> dict[str, Any] | None:
-    """Do this rank's part of the pipeline; the statistics of the run on rank 0, None elsewhere.
-
-    Ranks beyond the third have no part in this topology and only wait for the end. Collective.
-    """
-    match transport.rank:
-        case 0:
-            result = _coordinate(job, transport, progress)
-        case 1:
-            result = _sample(job, transport)
-        case 2:
-            result = _render(job, transport)
-        case _:
-            transport.meet()
-            result = None
+            result["balance"] = balance_record(layout, all_told, loop.balancer, screens)
+    elif transport.rank in layout.workers:
+        transport.send_note(0, Kind.STATISTICS, len(job.frames), told)
     transport.finish()
     return result
-
-
-def _coordinate(job: Job, transport: Transport, progress: Progress) -> dict[str, Any]:
-    loading = time.perf_counter()
-    clock = StageClock("culling")
-    culling = job.culling_node(job.scene.octree())
-    culling.process(job.camera(0))
-    layers = [layer_culling for layer_culling, _ in job.layer_nodes()]
-    progress("loading the scene", 0)
-    transport.meet()
-    counts = FrameCounts()
-    issued_s: list[float] = []
-    latency_s: list[float] = []
-
-    def frame_done() -> None:
-        frame, _ = transport.receive_note(RENDER, Kind.FRAME_DONE)
-        latency_s.append(time.perf_counter() - issued_s[frame])
-        progress("rendering", frame + 1)
-
-    started = time.perf_counter()
-    loading_s = started - loading
-    for frame in range(job.n_frames):
-        with clock.waiting():
-            while frame - len(latency_s) >= job.frames_in_flight or transport.has_note(RENDER, Kind.FRAME_DONE):
-                frame_done()
-        camera = job.camera(frame)
-        issued_s.append(time.perf_counter())
-        for rank in (SAMPLING, RENDER):
-            transport.send(rank, camera)
-        with clock.working():
-            bits = culling.process(camera)
-            bits_of_layers = [layer_culling.process(camera) for layer_culling in layers]
-        for message in (bits, *bits_of_layers):
-            transport.send(SAMPLING, message)
-        counts.add(bits)
-    while len(latency_s) < job.n_frames:
-        frame_done()
-    rendered_s = time.perf_counter() - started
-    of_sampling, of_render = (transport.receive_note(rank, Kind.STATISTICS)[1] for rank in (SAMPLING, RENDER))
-    ranks = [_statistics(transport, clock, counts), of_sampling, of_render]
-    return {
-        "rasterizer": of_render["rasterizer"],
-        "ranks": [rank["rank"] for rank in ranks],
-        "stages": {rank["stage"]: rank["summary"] for rank in ranks},
-        "messages": {kind: count for rank in ranks for kind, count in rank["messages"].items()},
-        "latency_ms": spread_ms(latency_s),
-        "per_frame": {name: values for rank in ranks for name, values in rank["per_frame"].items()},
-        "loading_s": loading_s,
-        "rendered_s": rendered_s,
-        "finished_s": time.perf_counter() - started,
-    }
 
 
 def receive_job(config: RunConfig, transport: Transport) -> Job:
@@ -191,76 +127,455 @@ def receive_job(config: RunConfig, transport: Transport) -> Job:
     return Job(config.model_copy(update=settled), scene)
 
 
-def _sample(job: Job, transport: Transport) -> None:
-    clock = StageClock("sampling")
-    if job.config.scene.delivery == "messages":
-        serve_scene(job.scene, job.colour, transport, RENDER)
-    octree = job.load_octree()
-    sampling = job.sampling_node(octree)
-    sampling.process(job.camera(0), job.culling_node(octree).process(job.camera(0)))
-    transport.meet()
-    layers = [node for _, node in job.layer_nodes()]
-    n_cells = [len(octree), *(len(layer.octree) for layer in job.layers)]
-    for _ in range(job.n_frames):
-        with clock.waiting():
-            camera = decode_camera(*transport.receive(CULLING, Kind.CAMERA, _MAX_CAMERA_BYTES))
-            bits, *bits_of_layers = [
-                decode_visibility(*transport.receive(CULLING, Kind.VISIBILITY, (n + 7) // 8), n) for n in n_cells
-            ]
+class FrameLoop:
+    """One rank's way through the frames of a job.
+
+    transport : None where there is one rank.  ready : called when all is loaded, before the first frame; by default
+    the ranks meet.
+    """
+
+    def __init__(
+        self,
+        job: Job,
+        layout: Layout,
+        transport: Transport | None,
+        progress: Progress,
+        ready: Callable[[], object] | None = None,
+    ) -> None:
+        self._job, self._layout, self._transport, self._progress = job, layout, transport, progress
+        self._rank = transport.rank if transport else 0
+        self._ready = ready or (transport.meet if transport else lambda: None)
+        self._lane = layout.lane_of(self._rank)
+        stages = layout.lanes[self._lane].stages_of(self._rank) if self._lane is not None else []
+        self._culls, self._samples, self._renders = (stage in stages for stage in STAGES[:3])
+        self._shows = self._rank == layout.display
+        self._clocks = {name: StageClock(name) for name in STAGES}
+        self._waits_in = self._clocks[stages[0] if stages else "culling"]
+        self._counts = FrameCounts()
+        self._handed: dict[tuple[Kind, int], deque[Any]] = {}  # from a stage of this rank to the next
+        self._held: dict[str, Any] = {}
+        self._plan = Plan(-1, (), (), ())
+        self._culling: CullingPart | None = None
+        self._sampling: SamplingPart | None = None
+        self.adopting_s: list[float] = []
+        self._balances = is_on(job.config.pipeline, layout, bool(screen_windows(job, layout)))
+        self.balancer: Balancer | None = None
+
+    def run(self) -> Drawn:
+        """Load what this rank's stages need, and do its part of every frame of the job."""
+        loading = time.perf_counter()
+        job = self._job
+        with ExitStack() as stack:
+            self._open_selection()
+            render = self._open_render(stack)
+            self._warm_up_selection()
+            self._progress("loading the scene", 0)
+            self._ready()
+            tell = self._open_balance() if self._balances else None
+            started = time.perf_counter()
+            frames = None
+            if self._rank == 0:
+                frames = Coordinator(job, self._layout, self._transport, self._plan, self.balancer)
+            coming = self._coming(frames, render)
+            for i in range(len(job.frames) if self._lane is not None else 0):
+                start, chosen, of_layers = next(coming)
+                if render and chosen:
+                    self._draw(render, start.camera, chosen, of_layers)
+                if self._shows and frames:
+                    frames.finished()
+                    self._progress("rendering", i + 1)
+                elif self._shows and self._transport:
+                    self._transport.send_note(0, Kind.FRAME_DONE, start.frame)
+                if tell:
+                    tell.done(i)
+            if frames:
+                frames.finish(self._progress)
+            drawn = time.perf_counter()
+            if self.balancer:
+                self.balancer.finish()
+        return Drawn(
+            [clock for clock in self._clocks.values() if clock.work_s],
+            self._counts,
+            render.times() if render else {},
+            render.description if render else "",
+            self._held,
+            frames.latency_s if frames else [],
+            started - loading,
+            started,
+            drawn,
+        )
+
+    # --- before the first frame --------------------------------------------------------------------------------------
+
+    def _open_selection(self) -> None:
+        """The octree and this rank's parts of it, if it selects or has a share of the points."""
+        job, layout = self._job, self._layout
+        if self._samples and self._transport and not self._shows and job.config.scene.delivery == "messages":
+            serve_scene(job.scene, job.colour, self._transport, layout.display)
+        self._shares: list[tuple[int, int]] = []
+        self._lanes: list[LaneCells] = []
+        selects = self._culls or self._samples
+        if selects or (self._renders and layout.split == "shares"):
+            whole = job.load_octree()
+            self._shares = shares_of(layout, whole)
+            if selects:
+                own = self._shares and len(self._shares) == len(layout.lanes) > 1
+                self._lanes = [
+                    LaneCells(lane, whole, self._shares[i] if own else None) for i, lane in enumerate(layout.lanes)
+                ]
+        self._adopt(first_plan(job, layout, self._lanes))
+        first = layout.lanes[0]
+        culls, samples = self._rank == first.culling[0], self._rank == first.sampling[0]
+        layers = job.layer_nodes() if culls or samples else []
+        self._layer_culling = [node for node, _ in layers] if culls else []
+        self._layer_sampling = [node for _, node in layers] if samples else []
+
+    def _adopt(self, plan: Plan) -> None:
+        """Make this rank's parts what a plan says."""
+        begun = time.perf_counter()
+        held, self._plan = self._plan, plan
+        if self._lane is not None and (self._culls or self._samples):
+            if (held.culling, held.sampling) != (plan.culling, plan.sampling):
+                self._make_parts(self._lane, plan)
+            for part in filter(None, (self._culling, self._sampling)):
+                part.look_through(self._layout, self._lane, plan)
+        self.adopting_s.append(time.perf_counter() - begun)
+
+    def _make_parts(self, lane: int, plan: Plan) -> None:
+        ranks, cells = self._layout.lanes[lane], self._lanes[lane]
+        if self._culls:
+            part = ranks.culling.index(self._rank)
+            self._culling = CullingPart(self._job, self._layout, lane, cells, plan, part)
+        if self._samples:
+            part = ranks.sampling.index(self._rank)
+            self._sampling = SamplingPart(self._job, self._layout, lane, cells, plan, part, self._shares)
+
+    def _open_balance(self) -> TimesTeller:
+        """Begin to tell rank 0 of stage times; on rank 0, to hear of them."""
+        from .balance.balancer import Balancer, make_policies, receive_cells, send_cells
+        from .balance.times import TimesTeller
+
+        transport, layout = self._transport, self._layout
+        assert transport
+        cells = [lane.dealt for lane in self._lanes]
+        by_processor = self._job.rasterizer == "cpu"
+        rank_0_selects = layout.lanes[0].stages_of(0) != ["render"]
+        if self._rank == 0:
+            if not rank_0_selects:
+                cells = receive_cells(layout, transport)
+                self._plan = with_borders(self._plan, layout, cells)
+            views, screens = self._job.views, bool(screen_windows(self._job, layout))
+            policies = make_policies(layout, cells, views.width, views.height, screens)
+            self.balancer = Balancer(layout, transport, policies, self._job.frames)
+            return TimesTeller(self._clocks, by_processor, self.adopting_s, self.balancer.hear)
+        if not rank_0_selects and self._rank == layout.lanes[0].culling[0]:
+            send_cells(cells, transport)
+
+        def tell(times: StageTimes) -> None:
+            transport.send_note(0, Kind.STAGE_TIMES, times.first, times.to_note())
+
+        return TimesTeller(self._clocks, by_processor, self.adopting_s, tell)
+
+    def taken_s(self) -> dict[str, list[float]]:
+        """By stage, seconds of each frame as load is balanced by."""
+        from .balance import BUSY_STAGES
+        from .balance.times import taken
+
+        by_processor = self._job.rasterizer == "cpu"
+        clocks = (self._clocks[stage] for stage in BUSY_STAGES)
+        return {clock.stage: taken(clock, by_processor).tolist() for clock in clocks if clock.work_s}
+
+    def _open_render(self, stack: ExitStack) -> RenderStage | None:
+        """The render stage of this rank, on its share of the points; None for a rank that draws nothing."""
+        job, number = self._job, self._layout.render.index(self._rank) if self._renders else 0
+        share, sample = None, np.empty(0)
+        transport = self._transport if self._layout.split == "shares" else None
+        if transport and self._renders:
+            first, stop = self._shares[number]
+            share = SceneShare(job.scene, first, stop, checked_by=(number, len(self._shares)))
+            self._held = {"first_point": first, "points": stop - first}
+            if job.colouring.range_is_open:
+                sample = job.colouring.range_sample(share, first, job.scene.info.n_stored)
+        if transport and job.colouring.range_is_open:  # the ends of a colour map are those of all points
+            job.colouring = job.colouring.with_range_of(transport.join(sample))
+        if not self._renders:
+            return None
+        screen = job.wall.screens[number] if job.wall and writes_screens(job, self._layout) else None
+        self._waits_for_screens = self._transport if screen else None
+        self._meet = None if screen else self._meeting()
+        shown = self._shows or screen is not None
+        return stack.enter_context(job.open_render(self._progress, share, shown=shown, screen=screen))
+
+    def _meeting(self) -> Callable[[int, np.ndarray], np.ndarray | None] | None:
+        """What takes a frame's number and the words of all render ranks to those of the picture, on the display rank;
+        None where one rank has it all.
+        """
+        ranks, transport, pipeline = self._layout.render, self._transport, self._job.config.pipeline
+        if transport is None or len(ranks) == 1:
+            return None
+        if self._layout.split == "tiles":
+            side_by_side = Tiles(transport, ranks)
+            return lambda frame, words: side_by_side.assemble(frame, words, self._plan.windows)
+        return make_compositor(pipeline.compositing, transport, ranks, radix=pipeline.radix).composite
+
+    def _warm_up_selection(self) -> None:
+        """Compile what selecting needs, or load what was compiled."""
+        camera = self._job.camera(self._job.frames[0]) if len(self._job.frames) else self._job.camera(0)
+        if self._culling:
+            self._culling.process(camera)
+        if self._sampling:
+            self._sampling.process(
+                camera, [VisibilityBits.pack(camera.frame, np.zeros(n, bool)) for n in self._sampling.n_cells]
+            )
+
+    # --- a frame -----------------------------------------------------------------------------------------------------
+
+    def _coming(
+        self, frames: Coordinator | None, render: RenderStage | None
+    ) -> Iterator[tuple[FrameStart, RenderPoints | None, list[RenderPoints]]]:
+        """Frames in turn, selected as far as that is this rank's part: start, points and objects to draw.
+
+        Where points are paged, up to ``frames_ahead`` more are selected, or received if they are there, before it is
+        the turn of one, so that theirs are loaded meanwhile. None where plans change: they say how a frame is drawn.
+        """
+        n_ahead = render.frames_ahead if render and not self._balances else 0
+        n_frames, begun = len(self._job.frames), 0
+        ahead: deque[tuple[FrameStart, RenderPoints | None, list[RenderPoints]]] = deque()
+        for i in range(n_frames):
+            while begun < n_frames and (begun == i or (begun - i <= n_ahead and self._can_begin(frames))):
+                ahead.append(self._begin(begun, frames))
+                chosen = ahead[-1][1]
+                if n_ahead and render and chosen:
+                    render.expect(chosen)
+                begun += 1
+            yield ahead.popleft()
+
+    def _can_begin(self, frames: Coordinator | None) -> bool:
+        """Whether to begin another frame before it is its turn: this rank selects it, or somebody has."""
+        if self._culls or self._samples or self._lane is None or not self._transport:
+            return True
+        sampled = (
+            self._transport.has_note(rank, Kind.RENDER_POINTS) for rank in self._layout.lanes[self._lane].sampling
+        )
+        return bool(frames or self._transport.has_note(0, Kind.FRAME_START)) and all(sampled)
+
+    def _begin(self, i: int, frames: Coordinator | None) -> tuple[FrameStart, RenderPoints | None, list[RenderPoints]]:
+        """Do what comes before drawing of frame ``i``; without points for a rank that does not draw."""
+        with self._waits_in.waiting():
+            start = frames.start(i, self._progress) if frames else self._receive_start()
+        self._follow(start.plan, frames)
+        self._select(start.camera)
+        if not self._renders:
+            return start, None, []
+        lane, info = self._layout.lanes[self._lane or 0], self._job.scene.info
+        most = info.n_cells + info.n_stored // 2**31 + 1  # a longer range is split
+        with self._clocks["render"].waiting():
+            received = [self._take_entries(rank, most) for rank in lane.sampling]
+            layers = self._job.layers if self._shows else []
+            of_layers = [self._take_entries(self._layout.lanes[0].sampling[0], len(layer.octree)) for layer in layers]
+        return start, merged_entries(start.camera.frame, received), of_layers
+
+    def _receive_start(self) -> FrameStart:
+        assert self._transport
+        return decode_frame_start(*self._transport.receive(0, Kind.FRAME_START, FRAME_START_BYTES))
+
+    def _follow(self, number: int, frames: Coordinator | None) -> None:
+        """Adopt plans until the one of a number holds. Rank 0 may have started frames by later ones."""
+        while self._plan.number < number:
+            if frames:
+                plan = frames.plans.pop(self._plan.number + 1)
+            else:
+                assert self._transport
+                plan = Plan.from_note(self._transport.receive_note(0, Kind.PLAN)[1])
+            self._adopt(plan)
+
+    def _select(self, camera: Camera) -> None:
+        """Do this rank's part of culling and sampling, and hand it to whoever samples and renders it."""
+        if self._lane is None:
+            return
+        lane, first = self._layout.lanes[self._lane], self._layout.lanes[0]
+        if self._culling:
+            with self._clocks["culling"].working():
+                bits = self._culling.process(camera)
+                of_layers = [node.process(camera) for node in self._layer_culling]
+            for rank, message in zip(lane.sampling, bits, strict=True):
+                self._hand(rank, Kind.VISIBILITY, message)
+            for message in of_layers:
+                self._hand(first.sampling[0], Kind.VISIBILITY, message)
+            self._counts.add(self._culling.whole)
+        if self._sampling:
+            with self._clocks["sampling"].waiting():
+                received = [
+                    self._take_bits(rank, n) for rank, n in zip(lane.culling, self._sampling.n_cells, strict=True)
+                ]
+                bits_of_layers = [
+                    self._take_bits(first.culling[0], len(layer.octree))
+                    for layer in self._job.layers[: len(self._layer_sampling)]
+                ]
+            with self._clocks["sampling"].working():
+                chosen, by_render = self._sampling.process(camera, received)
+                of_layers = [
+                    node.process(camera, seen) for node, seen in zip(self._layer_sampling, bits_of_layers, strict=True)
+                ]
+            for rank, message in zip(lane.render, by_render, strict=True):
+                self._hand(rank, Kind.RENDER_POINTS, message)
+            for message in of_layers:
+                self._hand(self._layout.display, Kind.RENDER_POINTS, message)
+            self._counts.add(chosen)
+
+    def _draw(self, render: RenderStage, camera: Camera, chosen: RenderPoints, of_layers: list[RenderPoints]) -> None:
+        """Rasterize this rank's part, and on the display rank make the picture of all parts."""
+        clock = self._clocks["render"]
         with clock.working():
-            chosen = [sampling.process(camera, bits)]
-            chosen += [node.process(camera, seen) for node, seen in zip(layers, bits_of_layers, strict=True)]
-        for message in chosen:
-            transport.send(RENDER, message)
-    transport.send_note(CULLING, Kind.STATISTICS, job.n_frames, _statistics(transport, clock, FrameCounts()))
+            words = render.rasterize(camera, chosen)
+            picture = None if self._meet else render.compose(camera, words, of_layers)
+        if self._meet:
+            with self._clocks["compositing"].working():
+                whole = self._meet(camera.frame, words)
+            if whole is not None:
+                with self._clocks["picture"].working():
+                    picture = render.compose(camera, whole, of_layers)
+        with clock.waiting():
+            render.show(camera.frame, picture)
+            if self._waits_for_screens:
+                self._meet_screens(self._waits_for_screens, camera.frame)
+        self._counts.add_layers(of_layers)
+        self._counts.add_residency(render.residency)
+
+    def _meet_screens(self, transport: Transport, frame: int) -> None:
+        """On the display rank: wait for every other screen's part of a frame, so that it is done when all are."""
+        display, *others = self._layout.render
+        if self._rank != display:
+            transport.send_note(display, Kind.FRAME_DONE, frame)
+            return
+        for rank in others:
+            transport.receive_note(rank, Kind.FRAME_DONE)
+
+    # --- between stages ----------------------------------------------------------------------------------------------
+
+    def _hand(self, rank: int, kind: Kind, message: Message) -> None:
+        if rank == self._rank:
+            self._handed.setdefault((kind, rank), deque()).append(message)
+        elif self._transport:
+            self._transport.send(rank, message)
+
+    def _take_bits(self, rank: int, n_cells: int) -> VisibilityBits:
+        if rank == self._rank:
+            return self._handed[Kind.VISIBILITY, rank].popleft()
+        assert self._transport
+        return decode_visibility(*self._transport.receive(rank, Kind.VISIBILITY, (n_cells + 7) // 8), n_cells)
+
+    def _take_entries(self, rank: int, most: int) -> RenderPoints:
+        if rank == self._rank:
+            return self._handed[Kind.RENDER_POINTS, rank].popleft()
+        assert self._transport
+        limit = most * RENDER_POINT.itemsize
+        return decode_render_points(*self._transport.receive(rank, Kind.RENDER_POINTS, limit))
 
 
-def _render(job: Job, transport: Transport) -> None:
-    clock = StageClock("render")
-    counts = FrameCounts()
-    info = job.scene.info
-    most_entries = [info.n_cells + info.n_stored // 2**31 + 1]  # a longer range is split
-    most_entries += [len(layer.octree) for layer in job.layers]
-    with job.open_render(lambda *_: None) as render:
-        transport.meet()
-        ahead: deque[tuple[Camera, RenderPoints, list[RenderPoints]]] = deque()
+class Coordinator:
+    """Starts frames on the other ranks, few enough at a time, and hears when they are done. On rank 0.
 
-        def receive() -> None:
-            camera = decode_camera(*transport.receive(CULLING, Kind.CAMERA, _MAX_CAMERA_BYTES))
-            chosen, *of_layers = [
-                decode_render_points(*transport.receive(SAMPLING, Kind.RENDER_POINTS, n * RENDER_POINT.itemsize))
-                for n in most_entries
-            ]
-            ahead.append((camera, chosen, of_layers))
-            if render.frames_ahead:
-                render.expect(chosen)
+    balancer : has the plan of each frame; None: the first one holds.
+    plans : by number, those that frames were started by and that this rank has not adopted yet.
+    """
 
-        for frame in range(job.n_frames):
-            with clock.waiting():
-                if not ahead:
-                    receive()
-                while len(ahead) <= render.frames_ahead and transport.has_note(SAMPLING, Kind.RENDER_POINTS):
-                    receive()  # frames that are sampled already
-            camera, chosen, of_layers = ahead.popleft()
-            with clock.working():
-                picture = render.draw(camera, chosen, of_layers)
-            with clock.waiting():
-                render.show(frame, picture)
-            counts.add(chosen)
-            counts.add_layers(of_layers)
-            counts.add_residency(render.residency)
-            transport.send_note(CULLING, Kind.FRAME_DONE, frame)
-    statistics = _statistics(transport, clock, counts)
-    statistics["per_frame"] |= render.times()
-    statistics["rasterizer"] = render.description
-    transport.send_note(CULLING, Kind.STATISTICS, job.n_frames, statistics)
+    def __init__(
+        self, job: Job, layout: Layout, transport: Transport | None, plan: Plan, balancer: Balancer | None = None
+    ) -> None:
+        self._job, self._transport, self._plan, self._balancer = job, transport, plan, balancer
+        self.plans: dict[int, Plan] = {}
+        self._others = [rank for rank in layout.workers if rank]
+        self._display = layout.display
+        self._ahead = job.frames_in_flight if self._others else 1 + job.frames_ahead
+        self._starts: list[FrameStart] = []
+        self._issued_s: list[float] = []
+        self.latency_s: list[float] = []
+
+    def start(self, i: int, progress: Progress) -> FrameStart:
+        """Frame ``i`` as this rank is to do it, once it may start; as many others as may start have been started."""
+        self._issue()
+        while len(self._starts) <= i or self._has_done():
+            self._hear(progress)
+            self._issue()
+        return self._starts[i]
+
+    def finished(self) -> None:
+        """Take note that the display has finished the next frame."""
+        self.latency_s.append(time.perf_counter() - self._issued_s[len(self.latency_s)])
+
+    def finish(self, progress: Progress) -> None:
+        """Hear of every frame that is still to be finished."""
+        while len(self.latency_s) < len(self._job.frames):
+            self._hear(progress)
+
+    def _issue(self) -> None:
+        frames = self._job.frames
+        while len(self._starts) < min(len(frames), len(self.latency_s) + self._ahead):
+            if self._balancer:
+                self._change_to(self._balancer.plan_for(len(self._starts), self._plan))
+            start = FrameStart(self._job.camera(frames[len(self._starts)]), self._plan.number)
+            for rank in self._others:
+                assert self._transport
+                self._transport.send(rank, start)
+            self._starts.append(start)
+            self._issued_s.append(time.perf_counter())
+
+    def _change_to(self, plan: Plan) -> None:
+        if plan is self._plan:
+            return
+        self._plan = self.plans[plan.number] = plan
+        for rank in self._others:
+            assert self._transport
+            self._transport.send_note(rank, Kind.PLAN, 0, plan.to_note())
+
+    def _has_done(self) -> bool:
+        return bool(self._display and self._transport and self._transport.has_note(self._display, Kind.FRAME_DONE))
+
+    def _hear(self, progress: Progress) -> None:
+        assert self._transport
+        self._transport.receive_note(self._display, Kind.FRAME_DONE)
+        self.finished()
+        progress("rendering", len(self.latency_s))
 
 
-def _statistics(transport: Transport, clock: StageClock, counts: FrameCounts) -> dict[str, Any]:
+def _told(layout: Layout, drawn: Drawn, transport: Transport) -> dict[str, Any]:
+    """What rank 0 is told of a rank, JSON-able."""
+    record = rank_record(layout.role_of(transport.rank), transport.rank) | drawn.held
+    record |= {"stages": {clock.stage: clock.summary() for clock in drawn.clocks}, "loading_s": drawn.loading_s}
     return {
-        "stage": clock.stage,
-        "summary": clock.summary(),
-        "rank": rank_record(clock.stage, transport.rank),
+        "rank": record,
+        "work_s": {clock.stage: clock.work_s for clock in drawn.clocks},
+        "wait_s": {clock.stage: sum(clock.wait_s) for clock in drawn.clocks},
+        "counts": drawn.counts.lists(),
+        "times": drawn.times,
+        "rasterizer": drawn.rasterizer,
         "messages": transport.traffic(),
-        "per_frame": {f"{clock.stage}_s": clock.work_s} | counts.lists(),
+    }
+
+
+def _merged(drawn: Drawn, told: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """The statistics of the run of what each rank told: a stage takes as long as the slowest of its ranks."""
+    clocks = []
+    for stage in STAGES:
+        having = [of for of in told if stage in of["work_s"]]
+        if having:
+            clock = StageClock(stage)
+            clock.work_s = np.max([of["work_s"][stage] for of in having], axis=0).tolist()
+            clock.wait_s = [min(of["wait_s"][stage] for of in having)]
+            clocks.append(clock)
+    counts: dict[str, list[Any]] = {}
+    for of in told:
+        for name, values in of["counts"].items():
+            counts[name] = np.add(counts[name], values).tolist() if name in counts else values
+    names = dict.fromkeys(name for of in told for name in of["times"])
+    times = {name: [s for of in told for s in of["times"].get(name, [])] for name in names}
+    rasterizer = next(of["rasterizer"] for of in told if of["rasterizer"])
+    per_frame = with_missing({f"{clock.stage}_s": clock.work_s for clock in clocks} | counts | times)
+    return drawn.record() | {
+        "rasterizer": rasterizer,
+        "stages": {clock.stage: clock.summary() for clock in clocks},
+        "per_frame": per_frame,
+        "ranks": [of["rank"] for of in told],
+        "messages": summed_traffic(of["messages"] for of in told),
     }

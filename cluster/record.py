@@ -7,7 +7,7 @@ import platform
 import resource
 import subprocess
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
@@ -25,18 +25,22 @@ RECORD_VERSION = 1
 
 
 class StageClock:
-    """Times of one stage, frame by frame: seconds of work and seconds of waiting for messages or room."""
+    """Times of one stage, frame by frame: seconds of work, of the processor in it, and of waiting for messages
+    or room.
+    """
 
     def __init__(self, stage: str) -> None:
         self.stage = stage
         self.work_s: list[float] = []
+        self.cpu_s: list[float] = []
         self.wait_s: list[float] = []
 
     @contextmanager
     def working(self) -> Iterator[None]:
         """Around one frame's work."""
-        start = time.perf_counter()
+        start, cpu = time.perf_counter(), time.process_time()
         yield
+        self.cpu_s.append(time.process_time() - cpu)
         self.work_s.append(time.perf_counter() - start)
 
     @contextmanager
@@ -86,6 +90,14 @@ class FrameCounts:
         return self._lists
 
 
+def with_missing(per_frame: dict[str, list[Any]]) -> dict[str, list[Any]]:
+    """The lists of a run with ``missing``: of each frame, the share of paged points that were not there."""
+    if "missing_points" not in per_frame:
+        return per_frame
+    counts = zip(per_frame["missing_points"], per_frame["wanted_points"], strict=True)
+    return per_frame | {"missing": [missing / max(wanted, 1) for missing, wanted in counts]}
+
+
 def spread_ms(seconds: list[float]) -> dict[str, float]:
     """Median, minimum, 95th percentile and maximum, in milliseconds; empty for no samples."""
     if not seconds:
@@ -93,6 +105,17 @@ def spread_ms(seconds: list[float]) -> dict[str, float]:
     values = np.asarray(seconds) * 1e3
     names = ("median", "min", "p95", "max")
     return dict(zip(names, (float(v) for v in np.percentile(values, [50, 0, 95, 100])), strict=True))
+
+
+def summed_traffic(of_ranks: Iterable[Mapping[str, Mapping[str, int]]]) -> dict[str, dict[str, int]]:
+    """Messages and bytes that ranks have sent together, by kind."""
+    sums: dict[str, dict[str, int]] = {}
+    for traffic in of_ranks:
+        for kind, counts in traffic.items():
+            of_kind = sums.setdefault(kind, {})
+            for unit, n in counts.items():
+                of_kind[unit] = of_kind.get(unit, 0) + n
+    return sums
 
 
 def rank_record(role: str, rank: int) -> dict[str, Any]:
@@ -117,7 +140,7 @@ def machine_record() -> dict[str, Any]:
         "system": f"{platform.system()} {platform.release()}",
         "python": platform.python_version(),
         "commit": _commit(),
-        "versions": {name: _version(name) for name in ("splatpipe", "numpy", "numba", "mpi4py", "moderngl")},
+        "versions": {name: package_version(name) for name in ("splatpipe", "numpy", "numba", "mpi4py", "moderngl")},
     }
 
 
@@ -141,7 +164,8 @@ def _commit() -> str | None:
         return None
 
 
-def _version(name: str) -> str | None:
+def package_version(name: str) -> str | None:
+    """Version of an installed package, None where it is not installed."""
     try:
         return version(name)
     except PackageNotFoundError:

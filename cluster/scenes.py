@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,9 @@ from ..shared.layers.layer_store import LAYER_FILE, open_layer
 from ..shared.octree import FEATURES
 from ..shared.pooled import PoolCounts
 from ..shared.readers import expand_inputs, open_source
+from ..shared.readers.source import Source
 from ..shared.store import Scene
+from .launch import inside_mpi
 from .progress import FrameProgress
 
 FLOAT32_BYTES = 12
@@ -27,35 +30,63 @@ FLOAT32_BYTES = 12
 _console = Console(highlight=False, soft_wrap=True)
 
 
-def build_command(inputs: list[str], output: Path, settings: BuildSettings, json: Path | None) -> None:
-    """``splatpipe build``."""
-    _build([open_source(path) for path in expand_inputs(inputs)], output, settings, json)
+def build_command(inputs: list[str], output: Path, settings: BuildSettings, json: Path | None, n_ranks: int) -> int:
+    """``splatpipe build``; the exit status."""
+    return _build(lambda: [str(path) for path in expand_inputs(inputs)], open_source, output, settings, json, n_ranks)
 
 
 def synth_command(
-    output: Path, n_points: int, seed: int, extent_m: float, settings: BuildSettings, json: Path | None
-) -> None:
-    """``splatpipe synth``: a scene, or a file where the name ends in .las or .laz."""
+    output: Path,
+    n_points: int,
+    seed: int,
+    extent_m: float,
+    settings: BuildSettings,
+    json: Path | None = None,
+    n_ranks: int = 0,
+) -> int:
+    """``splatpipe synth``: a scene, or a file where the name ends in .las or .laz; the exit status."""
     from ..shared.synth import CityScan, write_las
 
-    city = CityScan(n_points=n_points, seed=seed, extent_m=extent_m)
-    if output.suffix.lower() in (".las", ".laz"):
-        if output.exists() and not settings.overwrite:
-            raise InputError(f"{output}: exists already; --overwrite replaces it")
-        write_las(city, output)
-        _console.print(f"wrote {output}: {n_points:,} points")
-    else:
-        _build([city], output, settings, json)
+    if output.suffix.lower() not in (".las", ".laz"):
+        return _build(lambda: ["city"], lambda _: CityScan(n_points, seed, extent_m), output, settings, json, n_ranks)
+    if n_ranks > 1 or inside_mpi():
+        raise InputError(f"{output}: a point file is written by one process, expected a scene, or no ranks")
+    if output.exists() and not settings.overwrite:
+        raise InputError(f"{output}: exists already; --overwrite replaces it")
+    write_las(CityScan(n_points, seed, extent_m), output)
+    _console.print(f"wrote {output}: {n_points:,} points")
+    return 0
 
 
-def _build(sources: list[Any], output: Path, settings: BuildSettings, json: Path | None) -> None:
+def _build(
+    names: Callable[[], list[str]],
+    open_named: Callable[[str], Source],
+    output: Path,
+    settings: BuildSettings,
+    json: Path | None,
+    n_ranks: int,
+) -> int:
+    """Build on one rank, or on those that ``mpiexec`` has started, or start ``n_ranks``; the exit status."""
     started = time.perf_counter()
+
+    def tell(report: BuildReport) -> None:
+        seconds = time.perf_counter() - started
+        _tell_build(output, report, seconds, settings.positions)
+        if json is not None:
+            write_json(json, {"seconds": seconds, **asdict(report), "path": str(report.path)})
+
+    if inside_mpi():
+        from .build_ranks import build_on_ranks
+
+        return build_on_ranks(names, open_named, output, settings, n_ranks, tell)
+    if n_ranks > 1:
+        from .build_ranks import start_ranks
+
+        return start_ranks(n_ranks)
     with FrameProgress(None) as progress:
-        report = build_scene(sources, output, settings=settings, progress=progress.show)
-    seconds = time.perf_counter() - started
-    _tell_build(output, report, seconds, settings.positions)
-    if json is not None:
-        write_json(json, {"seconds": seconds, **asdict(report), "path": str(report.path)})
+        report = build_scene(map(open_named, names()), output, settings=settings, progress=progress.show)
+    tell(report)
+    return 0
 
 
 def _tell_build(output: Path, report: BuildReport, seconds: float, positions: str) -> None:

@@ -9,15 +9,16 @@ import os
 import queue
 import threading
 import time
+from collections.abc import Callable, Collection
 from concurrent.futures import Future, ThreadPoolExecutor
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from ..nodes.picture.compose import Picture
-from ..shared.errors import DeviceError
+from ..shared.errors import DeviceError, InputError
 from ..shared.files import disk_error, write_whole
 
 PNG_LEVEL = 1  # files 10 % larger than level 6 and five times as fast: the encoder must not be the slowest stage
@@ -27,30 +28,55 @@ LAYERS = {"png": ("frame", "png"), "depth": ("depth", "tiff"), "normals": ("norm
 """Layer → prefix and suffix of its files."""
 
 
+class Film(Protocol):
+    """Takes the pictures of a film in their order, in the thread that draws."""
+
+    times: list[float]
+    """Seconds that each picture took to encode."""
+
+    def put(self, rgba: np.ndarray) -> None:
+        """Take the next (h, w, 4) uint8 or uint16 picture; waits while too many are unencoded."""
+        ...
+
+    def close(self, keep: bool) -> None:
+        """End the film; not ``keep``: and take it away."""
+        ...
+
+
 class FrameSink:
     """Takes pictures in order; a context manager that ends with every file whole.
 
     png : write the colours of each, with as many bits as they have.  mp4 : make a film of them, 8 bits.
-    Depths and normals are written where a picture has them.
+    Depths and normals are written where a picture has them.  make_film : by path and pictures a second.
 
     ``put`` waits while more than ``backlog`` files are unencoded, which bounds memory. An error in an encoder is
     raised by the next ``put`` or at the end. A file is written under another name and renamed; the film gets its name
     at the end.
     """
 
-    def __init__(self, directory: Path, *, png: bool, mp4: bool, fps: float, workers: int = 2, backlog: int = 8):
+    def __init__(
+        self,
+        directory: Path,
+        *,
+        png: bool,
+        mp4: bool,
+        fps: float,
+        make_film: Callable[[Path, float], Film] | None = None,
+        workers: int = 2,
+        backlog: int = 8,
+    ) -> None:
         self.directory = directory
         self._png = png
         self._pool = ThreadPoolExecutor(workers, "encode")
         self._room = threading.BoundedSemaphore(backlog)
         self._pending: list[Future[None]] = []
-        self._film = _Film(directory / "film.mp4", fps) if mp4 else None
+        self._film = (make_film or H264Film)(directory / "film.mp4", fps) if mp4 else None
         self.times: dict[str, list[float]] = {}
         if self._film is not None:
             self.times["mp4_s"] = self._film.times
 
-    def put(self, number: int, picture: Picture) -> None:
-        """Queue a picture. Raises what an encoder of an earlier one ran into."""
+    def put(self, number: int, picture: Picture, screen: str = "") -> None:
+        """Queue a picture, or what a screen of a wall shows of it. Raises what an earlier one ran into."""
         self._raise_failed()
         if self._film is not None and picture.rgba is not None:
             self._film.put(picture.rgba)
@@ -62,7 +88,7 @@ class FrameSink:
             if image is not None:
                 times = self.times.setdefault(f"{layer}_s", [])
                 self._room.acquire()
-                self._pending.append(self._pool.submit(self._write, layer_name(layer, number), image, times))
+                self._pending.append(self._pool.submit(self._write, layer_name(layer, number, screen), image, times))
 
     def __enter__(self) -> FrameSink:
         return self
@@ -114,8 +140,8 @@ def _write_tiff(path: Path, depth: np.ndarray) -> None:
     Image.fromarray(depth).save(path, format="TIFF")
 
 
-class _Film:
-    """An H.264 film, encoded by one thread in frame order."""
+class H264Film:
+    """An H.264 film, encoded by one thread in frame order. Raises DeviceError where PyAV is missing."""
 
     def __init__(self, path: Path, fps: float) -> None:
         try:
@@ -133,11 +159,13 @@ class _Film:
         self._thread.start()
 
     def put(self, rgba: np.ndarray) -> None:
+        """As of ``Film``."""
         if self._error is not None:
             raise self._error
         self._frames.put(rgba)
 
     def close(self, keep: bool) -> None:
+        """As of ``Film``. Raises what encoding ran into."""
         self._frames.put(None)
         self._thread.join()
         if keep and self._error is None:
@@ -160,13 +188,11 @@ class _Film:
             stream: Any = None
             while (rgba := self._frames.get()) is not None:
                 started = time.perf_counter()
-                height, width = (side - side % 2 for side in rgba.shape[:2])  # 4:2:0 needs even sides
+                rgb = film_rgb(rgba)
                 if stream is None:
                     stream = container.add_stream("libx264", rate=self._rate)
-                    stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+                    stream.height, stream.width, stream.pix_fmt = *rgb.shape[:2], "yuv420p"
                     stream.options = {"preset": "veryfast", "crf": "20"}
-                rgb = rgba[:height, :width, :3]
-                rgb = np.ascontiguousarray(rgb if rgb.dtype == np.uint8 else rgb >> 8, np.uint8)
                 for packet in stream.encode(self._av.VideoFrame.from_ndarray(rgb, format="rgb24")):
                     container.mux(packet)
                 self.times.append(time.perf_counter() - started)
@@ -175,24 +201,64 @@ class _Film:
                     container.mux(packet)
 
 
-def layer_name(layer: str, number: int) -> str:
-    """File name of a layer of a picture."""
+def film_rgb(picture: np.ndarray) -> np.ndarray:
+    """(h, w, 3) uint8, C-contiguous: what a film shows of (h, w, 3 or 4) uint8 or uint16; 4:2:0 needs even sides."""
+    height, width = film_size(*picture.shape[:2])
+    rgb = picture[:height, :width, :3]
+    return np.ascontiguousarray(rgb if rgb.dtype == np.uint8 else rgb >> 8, np.uint8)
+
+
+def film_size(height: int, width: int) -> tuple[int, int]:
+    """Of a film of pictures of this size."""
+    return height - height % 2, width - width % 2
+
+
+def film_of_pictures(directory: Path, n_pictures: int, fps: float) -> None:
+    """Make ``film.mp4`` of the PNG files of all pictures. Raises InputError if one is unreadable or the disk full."""
+    from PIL import Image
+
+    film, whole = H264Film(directory / "film.mp4", fps), False
+    try:
+        for number in range(n_pictures):
+            with Image.open(directory / layer_name("png", number)) as image:
+                film.put(np.asarray(image.convert("RGB")))  # of 16 bits the upper 8, as in a film of a whole run
+        whole = True
+    except OSError as error:
+        raise InputError(f"{directory / layer_name('png', number)}: {error}") from None
+    finally:
+        film.close(keep=whole)
+
+
+def layer_name(layer: str, number: int, screen: str = "") -> str:
+    """File name of a layer of a picture, or of what a screen of a wall shows of it."""
     prefix, suffix = LAYERS[layer]
-    return f"{prefix}_{number:04d}.{suffix}"
+    return f"{prefix}_{number:04d}{screen and f'_{screen}'}.{suffix}"
 
 
-def prepare_output(directory: Path) -> None:
-    """Make the output directory and take away what an earlier run left there (its pictures, film and run.json).
-
-    Raises InputError if it cannot be made or written.
-    """
+def make_output(directory: Path) -> None:
+    """Make the output directory. Raises InputError if it cannot be made or written."""
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        write_whole(directory / "run.json", lambda part: part.write_bytes(b""))  # is it writable?
-        layers = [f"{prefix}_*.{suffix}" for prefix, suffix in LAYERS.values()]
-        left = [path for pattern in [*layers, ".*.part"] for path in directory.glob(pattern)]
-        for old in [*left, directory / "film.mp4"]:
-            old.unlink(missing_ok=True)
-        (directory / "run.json").unlink()
+        probe = directory / ".writable.part"
+        probe.touch()
+        probe.unlink(missing_ok=True)  # ranks may try at the same time
+    except OSError as error:
+        raise disk_error(error, directory) from None
+
+
+def prepare_output(directory: Path, keep: Collection[str] | None = None) -> None:
+    """Make the output directory and take away what an earlier run left there (its pictures, film and records).
+
+    keep : names of pictures that stay, and with them the record of what they are (``resume``).
+    Raises InputError if it cannot be made or written.
+    """
+    make_output(directory)
+    layers = [f"{prefix}_*.{suffix}" for prefix, suffix in LAYERS.values()]
+    records = ["run.json", "run.partial.json"] if keep is None else ["run.json"]
+    try:
+        for pattern in [*records, *layers, ".*.part", "film.mp4"]:  # records before what they are about
+            for old in directory.glob(pattern):
+                if old.name not in (keep or ()):
+                    old.unlink(missing_ok=True)
     except OSError as error:
         raise disk_error(error, directory) from None

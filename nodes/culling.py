@@ -13,10 +13,11 @@ from numba import njit
 
 from ..shared.camera import Camera
 from ..shared.messages import VisibilityBits
-from ..shared.octree import MAX_LEVEL, Octree
+from ..shared.octree import Octree
+from ..shared.windows import Window
+from .frustum import N_PLANES, frustum_planes, padded_half_edges
 from .point_filter import PointFilter
 
-N_PLANES = 5
 _PLANES = np.uint8((1 << N_PLANES) - 1)
 _CONE = np.uint8(1 << N_PLANES)
 _OUTSIDE = np.uint8(1 << 7)
@@ -53,13 +54,14 @@ class CullingNode:
         self._left = point_filter.cells_left(octree, self._half_edge)
         self.margin_px = margin_px
 
-    def process(self, camera: Camera) -> VisibilityBits:
+    def process(self, camera: Camera, window: Window | None = None) -> VisibilityBits:
         """The bits of one frame: 1 where a cell may be seen; the ancestors of such a cell are 1 too.
 
+        window : of the picture, where no more than that is drawn.
         Conservative: a cell is 0 only if no point below it is left by the boxes, nearer than ``near`` allows, falls
-        within ``margin_px`` of the image and faces the eye.  Cost: O(cells), about 2–5 ns each.
+        within ``margin_px`` of the image or window and faces the eye.  Cost: O(cells), about 2–5 ns each.
         """
-        planes = frustum_planes(camera, self.margin_px)
+        planes = frustum_planes(camera, self.margin_px, window)
         _cull(
             self._centers,
             self._level,
@@ -74,32 +76,6 @@ class CullingNode:
         if self._left is not None:
             visible &= self._left
         return VisibilityBits.pack(camera.frame, visible)
-
-
-def padded_half_edges(octree: Octree) -> np.ndarray:
-    """(MAX_LEVEL + 1,) float64 half edge of the cubes of each level, grown to hold what rounding moves out of them.
-
-    Stored float32 positions may lie outside their cell by a rounding of the root edge, centres and world coordinates by
-    one of the largest coordinate; and the rasterizer rounds depth.
-    """
-    half = np.ldexp(octree.edge, -np.arange(MAX_LEVEL + 1) - 1)
-    largest = np.abs(octree.origin).max() + octree.edge
-    return half * (1 + 2.0**-20) + octree.edge * 2.0**-22 + 4 * np.spacing(largest)
-
-
-def frustum_planes(camera: Camera, margin_px: float) -> np.ndarray:
-    """(5, 4) float64 half-spaces ``row[:3] · (p − eye) ≥ row[3]``: left, right, top, bottom, near.
-
-    There is no far plane. Relative to the eye, so that a scene far from the world's origin loses nothing.
-    """
-    x, y, w = camera.pixel_from_world[:, :3]
-    planes = np.zeros((N_PLANES, 4))
-    planes[0, :3] = x + margin_px * w
-    planes[1, :3] = (camera.width + margin_px) * w - x
-    planes[2, :3] = y + margin_px * w
-    planes[3, :3] = (camera.height + margin_px) * w - y
-    planes[4, :3], planes[4, 3] = w, camera.near
-    return planes
 
 
 @njit(nogil=True, cache=True)

@@ -23,6 +23,7 @@ the same.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -32,6 +33,8 @@ from ..shared.camera import Camera
 from ..shared.errors import ConfigError, MessageError
 from ..shared.messages import RENDER_POINT, RenderPoints, VisibilityBits
 from ..shared.octree import CORNER, EDGE, MAX_LEVEL, Octree
+from ..shared.windows import Window
+from .frustum import cubes_within, frustum_planes, padded_half_edges
 from .pooled_entries import POINT_BYTES, PooledForms
 
 Pools = Literal["off", "bytes", "time"]
@@ -64,6 +67,8 @@ class SamplingNode:
     point_bytes : what drawing a point of a range reads.
     point_budget : most points of a frame; 0: no limit. Ranges only, and of thresholds above 0.
     step : of the ladder of shares, of the last frame; 0: it was not thinned out.
+    own : (n,) bool, cells that this node answers for, where others draw the rest; None: all.
+    margin_px : as of the culling node, for windows.
     Raises ConfigError for a threshold that is not a finite number ≥ 0, points per pixel that are not one > 0, or an
     octree without pooled forms where they are to be drawn.
     """
@@ -78,6 +83,8 @@ class SamplingNode:
         pools: Pools = "off",
         point_bytes: float = POINT_BYTES,
         point_budget: int = 0,
+        own: np.ndarray | None = None,
+        margin_px: float = 1.0,
     ):
         if not (pixel_threshold >= 0 and math.isfinite(pixel_threshold)):
             raise ConfigError(f"sampling.pixel_threshold = {pixel_threshold}, expected a number ≥ 0")
@@ -91,6 +98,9 @@ class SamplingNode:
         self.pixel_threshold = float(pixel_threshold)
         self.points_per_pixel = float(points_per_pixel)
         self.whole_sets = whole_sets
+        self.margin_px = margin_px
+        self._others = None if own is None or own.all() else ~own
+        self._half_edges = padded_half_edges(octree)[octree.level]
         self._octree = octree
         self._edge = np.ldexp(octree.edge, -np.arange(MAX_LEVEL + 1))
         self._stored_order = np.argsort(octree.first_point, kind="stable").astype(np.int32)
@@ -137,15 +147,40 @@ class SamplingNode:
         n_cut = self._cut_to_budget(camera, bits) if self.pixel_threshold else self._all_leaves(bits)
         if self.whole_sets:
             np.copyto(self._n_drawn, tree.n_points, where=self._n_drawn > 0)
+        if self._others is not None:
+            self._n_drawn[self._others] = 0
+        n_pooled = self._take_pools(camera) if self._forms else 0
+        entries = self._ranges(n_cut)
+        if n_pooled:
+            entries = np.concatenate([entries, self._pooled_entries[:n_pooled]])
+        return RenderPoints(camera.frame, entries)
+
+    def within(self, camera: Camera, windows: Sequence[Window]) -> list[RenderPoints]:
+        """Of the frame processed last, what may be seen in each of several windows: the cells whose cubes reach in.
+
+        For ranges, not for pooled points.  Cost: a look at each cell of the cut for each window, and its entries.
+        """
+        tree = self._octree
+        cells = np.flatnonzero(self._n_drawn > 0)
+        n_drawn = self._n_drawn[cells]
+        seen = np.empty(len(cells), bool)
+        found = []
+        for window in windows:
+            planes = frustum_planes(camera, self.margin_px, window)
+            cubes_within(tree.centers, self._half_edges, cells, camera.eye, planes, seen)
+            self._n_drawn[cells] = np.where(seen, n_drawn, 0)
+            found.append(RenderPoints(camera.frame, self._ranges(len(cells))))
+        self._n_drawn[cells] = n_drawn
+        return found
+
+    def _ranges(self, n_cut: int) -> np.ndarray:
+        """(m,) RENDER_POINT of the ranges that ``_n_drawn`` says of at most ``n_cut`` cells."""
+        tree = self._octree
         entries = np.empty(n_cut + self._n_splits, RENDER_POINT)
         strided = tree.point_order == "depth-first"
-        n_pooled = self._take_pools(camera, strided) if self._forms else 0
-        n_ranges = _merge(
-            tree.first_point, tree.n_points, self._n_drawn, self._stored_order, strided, MAX_RANGE, entries
-        )
-        n_entries = n_ranges + n_pooled
-        entries[n_ranges:n_entries] = self._pooled_entries[:n_pooled]
-        return RenderPoints(camera.frame, entries[:n_entries])
+        return entries[
+            : _merge(tree.first_point, tree.n_points, self._n_drawn, self._stored_order, strided, MAX_RANGE, entries)
+        ]
 
     def _cut_to_budget(self, camera: Camera, bits: VisibilityBits) -> int:
         """Fill ``_n_drawn``; the size of the cut."""
@@ -200,7 +235,7 @@ class SamplingNode:
             self._n_drawn,
         )
 
-    def _take_pools(self, camera: Camera, strided: bool) -> int:
+    def _take_pools(self, camera: Camera) -> int:
         """Mark cells of the cut that are drawn from their pooled form, and fill ``_pooled_entries``; how many."""
         tree, forms = self._octree, self._forms
         assert forms
@@ -216,7 +251,7 @@ class SamplingNode:
             camera.eye,
             camera.near,
             camera.focal_px,
-            strided,
+            tree.point_order == "depth-first",
             MAX_RANGE,
             self._n_drawn,
             self._pooled_entries,

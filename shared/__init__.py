@@ -20,9 +20,11 @@ layers/            objects besides points
 framebuffer_runs   framebuffer words as they cross between ranks
 build/, rebuild    batches → scene (partition, level-of-detail sets, external), and again
 camera             cameras
+wall, windows      screens of a display wall; tiles of a picture
 camera_path,       orbit, keyframes, explicit poses
 keyframes
 messages           what crosses from one rank to another
+message_codecs     the same in fewer bytes
 config             the TOML configuration of a run
 colour             attribute → colour word
 metrics            how far one picture is from another

@@ -22,6 +22,7 @@ Vector = tuple[float, float, float]
 Matrix = list[list[float]]
 PositiveInt = Annotated[int, Field(ge=1)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Ranks = Annotated[int, Field(ge=0, le=65536)]
 
 
 def _byte_size(value: Any) -> str:
@@ -35,6 +36,19 @@ def _byte_size(value: Any) -> str:
 
 ByteSize = Annotated[str, BeforeValidator(_byte_size)]
 """Text that ``parse_bytes`` takes; a number of bytes will do."""
+
+Topology = Literal[
+    "auto",
+    "single",
+    "pipelined",
+    "master-slave",
+    "hybrid",
+    "sort-first",
+    "sort-last",
+    "sort-first-only",
+    "sort-last-only",
+    "frame-parallel",
+]
 
 AnySection = TypeVar("AnySection", bound=Section)
 
@@ -83,6 +97,17 @@ class CameraSection(Section):
     sweep_deg: float = 360.0
     keyframes: list[Keyframe] = Field(default=[])
     poses: list[Matrix] = Field(default=[])
+
+
+class WallSection(Section):
+    """``[wall]``."""
+
+    columns: Annotated[int, Field(ge=1, le=256)] = 1
+    rows: Annotated[int, Field(ge=1, le=256)] = 1
+    mullion_x_px: Annotated[int, Field(ge=0, le=4096)] = 0
+    mullion_y_px: Annotated[int, Field(ge=0, le=4096)] = 0
+    output: Literal["assembled", "tiles"] = "assembled"
+    mullion_colour: str = "#000000"
 
 
 class FilterSection(Section):
@@ -154,10 +179,21 @@ class SplatSection(Section):
 class PipelineSection(Section):
     """``[pipeline]``."""
 
-    topology: Literal["auto", "single", "pipelined", "frame-parallel", "sort-last-only"] = "auto"
-    ranks: Annotated[int, Field(ge=0, le=65536)] = 0
+    topology: Topology = "auto"
+    ranks: Ranks = 0
+    culling_ranks: Ranks = 0
+    sampling_ranks: Ranks = 0
+    render_ranks: Ranks = 0
+    render_split: Literal["tiles", "shares"] = "tiles"
+    balance: Literal["off", "measured"] = "off"
     frames_in_flight: Annotated[int, Field(ge=1, le=64)] = 4
+    compositing: Literal["auto", "direct", "direct-reduce", "binary-swap", "radix-k", "mpi-min"] = "auto"
+    radix: Annotated[int, Field(ge=2, le=1024)] = 8
     timeout_s: Positive = 300.0
+    loading_timeout_s: Positive = 3600.0
+    survive: bool = True
+    compression: Literal["auto", "off", "on"] = "auto"
+    link_mb_per_s: Annotated[float, Field(ge=0, le=1e9)] = 0.0
 
 
 class OutputSection(Section):
@@ -171,6 +207,7 @@ class OutputSection(Section):
     mp4: bool = False
     depth: bool = False
     normals: bool = False
+    resume: bool = False
 
 
 class RunConfig(Section):
@@ -178,6 +215,7 @@ class RunConfig(Section):
 
     scene: SceneSection = SceneSection()
     camera: CameraSection = CameraSection()
+    wall: WallSection = WallSection()
     filter: FilterSection = FilterSection()
     culling: CullingSection = CullingSection()
     sampling: SamplingSection = SamplingSection()
@@ -198,10 +236,7 @@ def load_config(path: Path | str, overrides: list[str] | None = None) -> RunConf
     Raises ConfigError naming the file and key, what was found and what was expected; an unknown key is refused and
     the nearest known one suggested.
     """
-    data = read_config(path)
-    for override in overrides or []:
-        _apply(data, override)
-    return parse_config(data, source=str(path))
+    return parse_config(read_config(path), str(path), overrides)
 
 
 def read_config(path: Path | str) -> dict[str, Any]:
@@ -232,8 +267,10 @@ def read_toml(path: Path | str) -> dict[str, Any]:
         raise ConfigError(f"{path}: not valid TOML: {error}") from None
 
 
-def parse_config(data: dict[str, Any], source: str = "configuration") -> RunConfig:
-    """The validated configuration of nested tables. Raises ConfigError as ``load_config`` does."""
+def parse_config(data: dict[str, Any], source: str = "configuration", overrides: list[str] | None = None) -> RunConfig:
+    """The validated configuration of nested tables with overrides. Raises ConfigError as ``load_config`` does."""
+    for override in overrides or []:
+        _apply(data, override)
     return validated(RunConfig, data, source)
 
 

@@ -6,13 +6,15 @@ pickled, and no length is believed before it is checked against what has arrived
 =================  ============================  ============================================================
 message            from → to                     payload
 =================  ============================  ============================================================
-``Camera``         coordinator → all             clip_from_world, eye, viewport, near
+``FrameStart``     coordinator → all             camera (clip_from_world, eye, viewport, near), number of the plan
 ``VisibilityBits`` culling → sampling            1 bit a cell, breadth-first, packed (least significant first)
 ``RenderPoints``   sampling → render             entries of (offset, range, stride)
 ``SceneOffer``     sampling → render             ``scene.json`` and the colour mode
 ``SceneRequest``   render → sampling             array, first byte, number of bytes; nothing: no more is needed
 ``SceneBytes``     sampling → render             the bytes asked for, as they are stored
-``Framebuffer``    share → share                 words of pixels, by runs (``framebuffer_runs``)
+``Framebuffer``    render → render               words of pixels, by runs (``framebuffer_runs``); none: background
+``FilmPicture``    render → rank 0               8-bit red, green, blue of each pixel
+``Build``          any → any                     JSON: how far a rank is with its part of a build, or that it failed
 =================  ============================  ============================================================
 
 Those of scenes cross before the first frame, where ``scene.delivery`` is ``messages``. Their header has the number of
@@ -22,6 +24,8 @@ Protocol versions
     1. The first.
     2. Scenes by messages.
     3. Framebuffers.
+    4. Frames start by a plan; notes of plans and of stage times; pictures of films; coded payloads
+       (``message_codecs``).
 """
 
 from __future__ import annotations
@@ -38,13 +42,16 @@ from .errors import MessageError, StoreError
 from .scene_info import MAX_INFO_BYTES, SceneInfo, info_from_json
 
 MAGIC = b"SPLT"
-PROTOCOL_VERSION = 3
+PROTOCOL_VERSION = 4
 HEADER = struct.Struct("<4sHHQQ")
-_CAMERA = struct.Struct("<16d3d2Id")
+CODED = 0x8000
+"""Bit of a header's kind that says that the payload is coded (``message_codecs``)."""
+_FRAME_START = struct.Struct("<16d3d2IdI")
 _SCENE_REQUEST = struct.Struct("<IIQ")
 _MAX_COLOUR_BYTES = 64
 MAX_OFFER_BYTES = _MAX_COLOUR_BYTES + 1 + MAX_INFO_BYTES
 MAX_REQUEST_BYTES = _SCENE_REQUEST.size
+FRAME_START_BYTES = _FRAME_START.size
 SCENE_PIECE_BYTES = 8 << 20
 """Most bytes that one ``SceneRequest`` may ask for."""
 
@@ -61,7 +68,7 @@ distance along the view axis (positive, so its bits order as integers); the near
 class Kind(IntEnum):
     """Kind of a message."""
 
-    CAMERA = 1
+    FRAME_START = 1
     VISIBILITY = 2
     RENDER_POINTS = 3
     FRAME_DONE = 4
@@ -70,6 +77,23 @@ class Kind(IntEnum):
     SCENE_REQUEST = 7
     SCENE_BYTES = 8
     FRAMEBUFFER = 9
+    PLAN = 10
+    FILM_PICTURE = 11
+    STAGE_TIMES = 12
+    BUILD = 32
+
+
+@dataclass(frozen=True)
+class FrameStart:
+    """A frame is to be drawn: its camera, and the number of the plan (``cluster.layout.Plan``) that holds for it."""
+
+    camera: Camera
+    plan: int = 0
+
+    @property
+    def frame(self) -> int:
+        """Frame number."""
+        return self.camera.frame
 
 
 @dataclass(frozen=True)
@@ -158,12 +182,27 @@ class Framebuffer:
     runs: np.ndarray
 
 
-Message = Camera | VisibilityBits | RenderPoints | SceneOffer | SceneRequest | SceneBytes | Framebuffer
+@dataclass(frozen=True)
+class FilmPicture:
+    """A picture of a film. frame : number of the picture.  rgb : (h, w, 3) uint8."""
+
+    frame: int
+    rgb: np.ndarray
 
 
-def header(kind: Kind, frame: int, length: int) -> bytes:
+Message = (
+    FrameStart | VisibilityBits | RenderPoints | SceneOffer | SceneRequest | SceneBytes | Framebuffer | FilmPicture
+)
+
+
+def header(kind: Kind, frame: int, length: int, *, coded: bool = False) -> bytes:
     """The 24 bytes in front of a payload."""
-    return HEADER.pack(MAGIC, PROTOCOL_VERSION, kind, frame, length)
+    return HEADER.pack(MAGIC, PROTOCOL_VERSION, kind | CODED * coded, frame, length)
+
+
+def is_coded(head: bytes | bytearray | memoryview) -> bool:
+    """Whether the payload behind a header that ``parse_header`` has taken is coded."""
+    return bool(HEADER.unpack_from(head)[2] & CODED)
 
 
 def parse_header(data: bytes | memoryview) -> tuple[Kind, int, int]:
@@ -176,7 +215,7 @@ def parse_header(data: bytes | memoryview) -> tuple[Kind, int, int]:
     if version != PROTOCOL_VERSION:
         raise MessageError(f"message header: found protocol {version}, expected {PROTOCOL_VERSION}")
     try:
-        return Kind(kind), frame, length
+        return Kind(kind & ~CODED), frame, length
     except ValueError:
         raise MessageError(f"message header: found kind {kind}, expected one of {[int(k) for k in Kind]}") from None
 
@@ -184,17 +223,19 @@ def parse_header(data: bytes | memoryview) -> tuple[Kind, int, int]:
 def encode(message: Message) -> tuple[bytes, memoryview]:
     """(header, payload) of a message. The payload is a view where the message holds an array: no copy."""
     match message:
-        case Camera():
+        case FrameStart():
+            camera = message.camera
             payload = memoryview(
-                _CAMERA.pack(
-                    *np.asarray(message.clip_from_world, np.float64).ravel(),
-                    *np.asarray(message.eye, np.float64),
-                    message.width,
-                    message.height,
-                    message.near,
+                _FRAME_START.pack(
+                    *np.asarray(camera.clip_from_world, np.float64).ravel(),
+                    *np.asarray(camera.eye, np.float64),
+                    camera.width,
+                    camera.height,
+                    camera.near,
+                    message.plan,
                 )
             )
-            return header(Kind.CAMERA, message.frame, len(payload)), payload
+            return header(Kind.FRAME_START, message.frame, len(payload)), payload
         case VisibilityBits():
             payload = np.ascontiguousarray(message.bits).data
             return header(Kind.VISIBILITY, message.frame, len(payload)), payload
@@ -213,16 +254,20 @@ def encode(message: Message) -> tuple[bytes, memoryview]:
         case Framebuffer():
             payload = np.ascontiguousarray(message.runs).data
             return header(Kind.FRAMEBUFFER, message.frame, len(payload)), payload
+        case FilmPicture():
+            payload = np.ascontiguousarray(message.rgb).reshape(-1).data
+            return header(Kind.FILM_PICTURE, message.frame, len(payload)), payload
 
 
 Bytes = bytes | bytearray | memoryview
 
 
-def decode_camera(frame: int, payload: Bytes) -> Camera:
-    """The camera of a payload. Raises MessageError for a wrong length."""
-    _expect(Kind.CAMERA, len(payload), _CAMERA.size)
-    v = _CAMERA.unpack(payload)
-    return Camera(frame, np.array(v[:16]).reshape(4, 4), np.array(v[16:19]), v[19], v[20], v[21])
+def decode_frame_start(frame: int, payload: Bytes) -> FrameStart:
+    """The start of a frame of a payload. Raises MessageError for a wrong length."""
+    _expect(Kind.FRAME_START, len(payload), _FRAME_START.size)
+    v = _FRAME_START.unpack(payload)
+    camera = Camera(frame, np.array(v[:16]).reshape(4, 4), np.array(v[16:19]), v[19], v[20], v[21])
+    return FrameStart(camera, v[22])
 
 
 def decode_visibility(frame: int, payload: Bytes, n_cells: int) -> VisibilityBits:

@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from .array_source import Column, ReadColumn
+from .messages import RENDER_POINT
 from .octree import Octree
 from .store import PositionReader, Scene
 
@@ -27,6 +28,21 @@ def share_borders(octree: Octree, n: int) -> np.ndarray:
     after = np.searchsorted(borders, wanted)
     before = np.maximum(after - 1, 0)
     return borders[np.where(wanted - borders[before] < borders[after] - wanted, before, after)]
+
+
+def clip_entries(entries: np.ndarray, first: int, stop: int) -> np.ndarray:
+    """(k,) RENDER_POINT of the points that (m,) entries name in first … stop − 1, offsets relative to ``first``.
+
+    No entry may be of pooled points.  Cost: some passes over the entries, in NumPy.
+    """
+    offset, length, stride = (entries[name].astype(np.int64) for name in ("offset", "range", "stride"))
+    skipped = np.maximum(-(-(first - offset) // stride), 0)  # points before the share
+    begin, end = offset + skipped * stride, np.minimum(offset + length, stop)
+    kept = begin < end
+    out = np.empty(int(kept.sum()), RENDER_POINT)
+    out["offset"], out["range"] = begin[kept] - first, (end - begin)[kept]
+    out["stride"] = entries["stride"][kept]
+    return out
 
 
 class SceneShare(Scene):

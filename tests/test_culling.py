@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from helpers_octree import build_cloud, leaf_of_points, scenes
 from hypothesis import given, settings
-from splatpipe.nodes.culling import CullingNode, padded_half_edges
+from splatpipe.nodes.culling import CullingNode
+from splatpipe.nodes.frustum import padded_half_edges
 from splatpipe.shared.camera import look_at, perspective_camera
 
 EXAMPLES = settings(max_examples=150, derandomize=True, deadline=None)

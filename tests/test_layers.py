@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from layer_example import look_at_box, random_cuboids
-from splatpipe.nodes.culling import CullingNode, frustum_planes
+from splatpipe.nodes.culling import CullingNode
+from splatpipe.nodes.frustum import frustum_planes
 from splatpipe.nodes.layer_sampling import LayerSamplingNode
 from splatpipe.shared.errors import InputError, MessageError, StoreError
 from splatpipe.shared.layers.box_octree import box_octree

@@ -45,14 +45,16 @@ def picture(folder, name, frame=1):
 @pytest.mark.gl
 @pytest.mark.mpi
 @needs_gl
-def test_three_ranks_draw_the_bits_of_one_and_both_show_points_and_objects(folder):
-    for name, topology in (("one", "single"), ("three", "pipelined")):
-        done = run(folder, name, f"pipeline.topology={topology}")
+def test_several_ranks_draw_the_bits_of_one_and_both_show_points_and_objects(folder):
+    topologies = {"one": ("single", 1), "three": ("pipelined", 3), "tiles": ("hybrid", 4), "shares": ("sort-last", 4)}
+    for name, (topology, ranks) in topologies.items():
+        done = run(folder, name, f"pipeline.topology={topology}", f"pipeline.ranks={ranks}")
         assert done.returncode == 0, done.stderr
     bare = run(folder, "bare", "pipeline.topology=single", layers=())
     assert bare.returncode == 0, bare.stderr
     points, both = picture(folder, "bare"), picture(folder, "one")
-    assert all(np.array_equal(picture(folder, "one", i), picture(folder, "three", i)) for i in range(3))
+    for name in topologies:
+        assert all(np.array_equal(picture(folder, "one", i), picture(folder, name, i)) for i in range(3)), name
     differs = (points != both).any(axis=2)
     assert 0.005 < differs.mean() < 0.5
     assert "layers (" in (folder / "one" / "run.json").read_text()

@@ -9,10 +9,11 @@ from splatpipe.shared.errors import MessageError
 from splatpipe.shared.messages import (
     HEADER,
     RENDER_POINT,
+    FrameStart,
     Kind,
     RenderPoints,
     VisibilityBits,
-    decode_camera,
+    decode_frame_start,
     decode_render_points,
     decode_visibility,
     encode,
@@ -23,8 +24,8 @@ from splatpipe.shared.messages import (
 
 def decode(kind, frame, payload, n_cells):
     match kind:
-        case Kind.CAMERA:
-            return decode_camera(frame, payload)
+        case Kind.FRAME_START:
+            return decode_frame_start(frame, payload)
         case Kind.VISIBILITY:
             return decode_visibility(frame, payload, n_cells)
         case Kind.RENDER_POINTS:
@@ -41,7 +42,9 @@ def through_bytes(message, n_cells=0):
 def test_a_camera_survives_to_the_bit():
     pose = look_at(np.array([6.4e6, -2.0, 1e-3]), np.array([6.4e6, 5.0, 0.0]), np.array([0.0, 0.0, 1.0]))
     camera = perspective_camera(frame=3, world_from_camera=pose, fov_y_rad=0.7, width=1920, height=1080, near=0.01)
-    got = through_bytes(camera)
+    start = through_bytes(FrameStart(camera, 7))
+    got = start.camera
+    assert (start.frame, start.plan) == (3, 7)
     assert (got.frame, got.width, got.height, got.near) == (3, 1920, 1080, 0.01)
     assert got.clip_from_world.tobytes() == camera.clip_from_world.tobytes()
     assert got.eye.tobytes() == camera.eye.tobytes()
@@ -68,10 +71,10 @@ def test_render_points_survive_and_count_what_they_draw():
     ("data", "said"),
     [
         (b"", "found 0 bytes, expected 24"),
-        (header(Kind.CAMERA, 0, 0)[:-1], "found 23 bytes"),
+        (header(Kind.FRAME_START, 0, 0)[:-1], "found 23 bytes"),
         (HEADER.pack(b"NOPE", 1, 1, 0, 0), "found magic b'NOPE'"),
-        (HEADER.pack(b"SPLT", 1, 1, 0, 0), "found protocol 1, expected 3"),
-        (HEADER.pack(b"SPLT", 3, 77, 0, 0), "found kind 77"),
+        (HEADER.pack(b"SPLT", 1, 1, 0, 0), "found protocol 1, expected 4"),
+        (HEADER.pack(b"SPLT", 4, 77, 0, 0), "found kind 77"),
     ],
 )
 def test_foreign_headers_are_refused(data, said):
@@ -81,7 +84,9 @@ def test_foreign_headers_are_refused(data, said):
 
 @settings(max_examples=200, derandomize=True)
 @given(
-    st.sampled_from([Kind.CAMERA, Kind.VISIBILITY, Kind.RENDER_POINTS]), st.binary(max_size=300), st.integers(0, 4000)
+    st.sampled_from([Kind.FRAME_START, Kind.VISIBILITY, Kind.RENDER_POINTS]),
+    st.binary(max_size=300),
+    st.integers(0, 4000),
 )
 def test_any_payload_is_decoded_or_refused(kind, payload, n_cells):
     try:

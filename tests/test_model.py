@@ -349,8 +349,8 @@ def test_three_ranks_are_measured_and_what_they_save_says_the_same(tmp_path):
     sent = {(t["sender"], t["receiver"]): t["bytes"]["value"] for t in content["application"]["traffic"]}
     messages = content["run"]["messages"]
     frames = content["run"]["frames"]
-    assert sent[0, 2] * 2 * frames == messages["CAMERA"]["bytes"]
-    assert sent[0, 1] * frames == messages["CAMERA"]["bytes"] / 2 + messages["VISIBILITY"]["bytes"]
+    assert sent[0, 2] * 2 * frames == messages["FRAME_START"]["bytes"]
+    assert sent[0, 1] * frames == messages["FRAME_START"]["bytes"] / 2 + messages["VISIBILITY"]["bytes"]
     assert sent[1, 2] * frames >= messages["RENDER_POINTS"]["bytes"]  # the largest of any frame
     assert sent[2, 0] * frames == messages["FRAME_DONE"]["bytes"]
 

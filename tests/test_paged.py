@@ -165,7 +165,7 @@ def test_what_is_drawn_at_once_is_the_resident_part_and_ancestors_of_the_rest(sc
             shares.append(rasterizer.residency.missing)
             wanted = np.concatenate([np.arange(e["offset"], e["offset"] + e["range"]) for e in entries]).astype(int)
             lost = wanted[~there[wanted // PAGE]]
-            assert rasterizer.residency.missing == len(lost) / len(wanted)
+            assert (rasterizer.residency.missing_points, rasterizer.residency.wanted_points) == (len(lost), len(wanted))
             drawn = np.zeros(len(points), bool)
             drawn[wanted[there[wanted // PAGE]]] = True
             for cell in np.unique(np.searchsorted(sets.first, lost, side="right") - 1):
@@ -237,6 +237,7 @@ def test_a_run_says_what_was_missing_and_how_much_was_read(scenes, tmp_path):
     found = run_single(job_of(scenes / "layered", tmp_path, **memory, output__frames=8), lambda *_: None)
     per_frame = found["per_frame"]
     assert [len(per_frame[name]) for name in ("missing", "loaded_bytes", "evicted_pages", "points")] == [8] * 4
+    assert per_frame["wanted_points"] == per_frame["points"]
     assert all(0 <= share <= 1 for share in per_frame["missing"])
     assert sum(per_frame["loaded_bytes"]) > 0
     complete = run_single(

@@ -64,6 +64,7 @@ def test_a_bare_scene_leaves_out_what_it_has_no_use_for(config):
     found = names(job_of(config, "render.colour=#ff8000", "sampling.pixel_threshold=0"))
     assert found == {
         named.MPI,
+        named.COMPRESSION,
         "delivery of the scene by messages",
         "compositing",
         named.NO_NORMALS,

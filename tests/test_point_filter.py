@@ -8,7 +8,8 @@ from build_sources import ArraySource
 from helpers_octree import leaf_of_points, scenes
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from splatpipe.nodes.culling import CullingNode, padded_half_edges
+from splatpipe.nodes.culling import CullingNode
+from splatpipe.nodes.frustum import padded_half_edges
 from splatpipe.nodes.point_filter import ClipBox, PointFilter, features_left
 from splatpipe.nodes.raster import CellFeatures, PointSize, ResidentPoints, SplatSettings
 from splatpipe.nodes.raster.choose import make_rasterizer

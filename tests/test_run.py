@@ -113,7 +113,7 @@ def test_the_record_says_where_time_and_bytes_went(config, tmp_path):
     assert json.loads(copy.read_text()) == run
     assert [rank["role"] for rank in run["ranks"]] == ["culling", "sampling", "render"]
     assert set(run["stages"]) == {"culling", "sampling", "render"}
-    assert run["messages"]["CAMERA"]["count"] == 6
+    assert run["messages"]["FRAME_START"]["count"] == 6
     cells = run["scene"]["cells"]
     assert run["messages"]["VISIBILITY"] == {"count": 3, "bytes": 3 * (24 + (cells + 7) // 8)}
     assert run["messages"]["RENDER_POINTS"]["count"] == 3
@@ -130,10 +130,10 @@ def test_mpirun_starts_it_too_and_too_few_ranks_are_refused(config, tmp_path):
     assert done.returncode == 0, done.stderr
     assert len(pictures(tmp_path / "out")) == 3
     started[2] = "2"
-    done = call(*started)
+    done = call(*started, "--set", "pipeline.ranks=3")
     assert done.returncode == 2
     said = [line for line in done.stderr.splitlines() if line.startswith("splatpipe:")]
-    assert said == ["splatpipe: pipeline.topology: found 2 ranks, expected 3: mpirun -n 3"]
+    assert said == ["splatpipe: pipeline.ranks: found 2 ranks, expected 3: mpirun -n 3"]
 
 
 def test_one_rank_imports_neither_mpi_nor_opengl_nor_what_it_does_not_write(config, tmp_path):

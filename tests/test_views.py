@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from splatpipe.nodes.culling import frustum_planes
+from splatpipe.nodes.frustum import frustum_planes
 from splatpipe.shared.config import CameraSection
 from splatpipe.shared.views import STEREO_SHARE, camera_views, cube_face_px
 

@@ -1,4 +1,4 @@
-"""``splatpipe bench build``: a LAS file → a scene, in memory and with a quarter of the memory that would take.
+"""``splatpipe bench build``: a LAS file → a scene, in memory, with a quarter of the memory that takes, and on ranks.
 
 Each build is a process of its own running ``splatpipe build``, timed from its start to its end, interpreter and imports
 included, with the input in the page cache. The file is an airborne survey of rolling ground, point format 3 with every
@@ -38,32 +38,37 @@ def bench_build(
     *,
     memory_bytes: int | None = None,
     repeats: int = 3,
+    ranks: int = 0,
     workdir: Path | None = None,
 ) -> dict[str, Any]:
     """Time ``splatpipe build`` of an ``n_points`` LAS file in scan-line and in shuffled order, and out of core.
 
     memory_bytes : for the in-memory builds; None for twice what they need.
+    ranks : also on so many MPI ranks of this host, with the memory and the cores of one process among them; 0: not.
     workdir : where files and scenes go; the files are kept there for the next time. None for a temporary folder.
     Returns a JSON-able dict: ``rows`` (one for each case) and the machine.
     Raises SplatpipeError if a build fails.
     """
     if workdir is None:
         with tempfile.TemporaryDirectory(prefix="splatpipe-bench-") as folder:
-            return bench_build(n_points, memory_bytes=memory_bytes, repeats=repeats, workdir=Path(folder))
+            return bench_build(n_points, memory_bytes=memory_bytes, repeats=repeats, ranks=ranks, workdir=Path(folder))
     workdir.mkdir(parents=True, exist_ok=True)
     enough = memory_bytes or 2 * n_points * _BYTES_IN_MEMORY + _PROCESS_BYTES
     quarter = n_points * _BYTES_IN_MEMORY // 4 + _PROCESS_BYTES
     rows = []
-    for case, order, memory in (
-        ("in memory", "scan lines", enough),
-        ("in memory", "shuffled", enough),
-        ("external", "scan lines", quarter),
-    ):
+    cases = [
+        ("in memory", "scan lines", enough, 0),
+        ("in memory", "shuffled", enough, 0),
+        ("external", "scan lines", quarter, 0),
+    ]
+    if ranks:
+        cases.append((f"{ranks} ranks", "scan lines", enough, ranks))
+    for case, order, memory, n_ranks in cases:
         file = workdir / f"survey-{n_points}-{order.replace(' ', '-')}.las"
         if not file.exists():
             write_survey(file, n_points, shuffled=order == "shuffled")
         _read_through(file)
-        rows.append({"case": case, "order": order, **_measure(file, n_points, memory, repeats)})
+        rows.append({"case": case, "order": order, **_measure(file, n_points, memory, repeats, n_ranks)})
     return {"benchmark": "build", "n_points": n_points, "repeats": repeats, "rows": rows, "machine": machine_record()}
 
 
@@ -114,12 +119,12 @@ def _read_through(file: Path) -> None:
             pass
 
 
-def _measure(file: Path, n_points: int, memory: int, repeats: int) -> dict[str, Any]:
+def _measure(file: Path, n_points: int, memory: int, repeats: int, n_ranks: int) -> dict[str, Any]:
     seconds, reports = [], []
-    _build(file, memory)  # compiles the kernels, where they are not cached yet
+    _build(file, memory, n_ranks)  # compiles the kernels, where they are not cached yet
     for _ in range(repeats):
         os.sync()
-        wall_s, report = _build(file, memory)
+        wall_s, report = _build(file, memory, n_ranks)
         seconds.append(wall_s)
         reports.append(report)
     median = statistics.median(seconds)
@@ -141,12 +146,12 @@ def _measure(file: Path, n_points: int, memory: int, repeats: int) -> dict[str, 
     }
 
 
-def _build(file: Path, memory: int) -> tuple[float, dict[str, Any]]:
+def _build(file: Path, memory: int, n_ranks: int) -> tuple[float, dict[str, Any]]:
     """(seconds, report) of one ``splatpipe build``; the scene is removed again."""
     with tempfile.TemporaryDirectory(dir=file.parent, prefix="build-") as folder:
         told = Path(folder, "report.json")
         command = [sys.executable, "-m", "splatpipe.cluster", "build", str(file), "-o", str(Path(folder, "scene"))]
-        command += ["--memory", str(memory), "--json", str(told)]
+        command += ["--memory", str(memory), "--json", str(told), "--ranks", str(n_ranks)]
         start = time.perf_counter()
         done = subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, check=False)
         wall_s = time.perf_counter() - start

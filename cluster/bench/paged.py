@@ -28,7 +28,7 @@ from ...shared.scene_info import SCENE_FILE
 from ..job import Job
 from ..paging import told_ahead
 from ..progress import FrameProgress
-from ..record import FrameCounts, machine_record, rank_record, spread_ms
+from ..record import FrameCounts, machine_record, rank_record, spread_ms, with_missing
 
 
 def bench_paged(
@@ -115,7 +115,7 @@ def draw_paged(settings: dict[str, Any], frames: list[int], kept: list[int], ste
                 np.save(f"{stem}-{camera.frame}.npy", words)
             started = time.perf_counter()
         held = rank_record("single", 0)
-    lists = counts.lists()
+    lists = with_missing(counts.lists())
     return {
         "frames_per_s": len(frames) / sum(frame_s),
         "frame_ms": spread_ms(frame_s),

@@ -22,7 +22,13 @@ SWEPT_SECTIONS = ("sampling", "render", "culling", "splats", "positions", "image
 REFERENCE_KEYS = ("render.colour", "render.colormap", "render.colour_range", "render.background")
 """A sweep may change any key of those sections but these: camera, scene and colour stay what the reference shows."""
 
-_AS_DRAWN = (("camera", "view", "mono"), ("render", "supersampling", 1), ("render", "edl_strength", 0.0))
+_AS_DRAWN = (
+    ("camera", "view", "mono"),
+    ("wall", "columns", 1),
+    ("wall", "rows", 1),
+    ("render", "supersampling", 1),
+    ("render", "edl_strength", 0.0),
+)
 """What composes a picture of frames, and is not measured."""
 
 Value = bool | int | float | str

@@ -21,7 +21,7 @@ from ...nodes.raster.reference import reference_frame
 from ...shared.camera import Camera
 from ...shared.colour import Colouring
 from ...shared.files import write_whole
-from ...shared.messages import FRAMEBUFFER_EMPTY, RENDER_POINT, encode
+from ...shared.messages import FRAMEBUFFER_EMPTY, RENDER_POINT, FrameStart, encode
 from ...shared.rebuild import leaf_ranges
 from ...shared.scene_info import SCENE_FILE
 from ...shared.store import Scene
@@ -61,7 +61,7 @@ class References:
         Cost: about 1 µs a point the first time, more where points are larger than a pixel.
         """
         key = self._key.copy()
-        key.update(b"".join(encode(camera)))
+        key.update(b"".join(encode(FrameStart(camera))))
         path = self._folder / f"{key.hexdigest()[:24]}.npz"
         frame = _kept(path, (camera.height, camera.width))
         if frame is None:

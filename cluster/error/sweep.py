@@ -17,7 +17,7 @@ from ...shared import metrics
 from ...shared.camera import Camera
 from ...shared.colour import frame_to_rgba
 from ...shared.errors import DeviceError
-from ...shared.messages import encode
+from ...shared.messages import FrameStart, encode
 from ..progress import FrameProgress
 from .config import ErrorConfig, SweepPoint
 from .picture import decode_picture, encode_picture
@@ -158,7 +158,7 @@ def _frame_errors(
     scene: SweptScene, point: SweepPoint, pipeline: Pipeline, camera: Camera, reference: np.ndarray
 ) -> dict[str, float | None]:
     bits, chosen, words = pipeline.draw(camera)
-    messages = (camera, camera, bits, chosen)  # the camera goes to the sampling and to the render rank
+    messages = (FrameStart(camera), FrameStart(camera), bits, chosen)  # it goes to the sampling and to the render rank
     message_bytes = sum(len(header) + len(payload) for header, payload in map(encode, messages))
     image = point.config.image
     encoded = encode_picture(_rgb(words, scene), image)

@@ -11,7 +11,7 @@ import numpy as np
 from ...nodes.pooled_entries import PooledForms
 from ...nodes.raster.reference import covered_pixels
 from ...shared.config import load_config
-from ...shared.messages import HEADER, RENDER_POINT, encode
+from ...shared.messages import HEADER, RENDER_POINT, FrameStart, encode
 from ...shared.octree import Octree
 from ..job import Job
 from ..measured import measured_run
@@ -117,7 +117,7 @@ def _traffic(run: dict[str, Any], job: Job, bits_bytes: int, entries_bytes: int)
     role = {rank["role"]: rank["rank"] for rank in run["ranks"]}
     if len(role) == 1:
         return ()
-    camera = sum(map(len, encode(job.camera(0))))
+    camera = sum(map(len, encode(FrameStart(job.camera(0)))))
     sent = {
         ("culling", "sampling"): (2, camera + HEADER.size + bits_bytes),
         ("culling", "render"): (1, camera),

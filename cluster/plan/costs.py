@@ -20,6 +20,8 @@ class UnitCosts:
     entry_s : of a render-points entry, before the threads start.
     gl_point_s : of a GPU, which takes no core; not measured.  picture_s, png_s, mp4_s : of a pixel.
     message_s, message_byte_s : a frame's messages and waits, each of their bytes.
+    code_byte_s : coding and decoding a byte.  coded_framebuffer, coded_bits : what is left of it;
+    coded_entry_bytes : of a render-points entry (``splatpipe bench messages``).
     start_s : three ranks instead of one, until the first frame.
     back_face_s, lod_s : of a cell.  flatness_s : of a point, when building.  checksum_s : of a byte.
     opengl_s, colour_maps_s : import, and for OpenGL a context.
@@ -39,6 +41,10 @@ class UnitCosts:
     mp4_s: float = 29e-9
     message_s: float = 0.5e-3
     message_byte_s: float = 1e-9
+    code_byte_s: float = 3.5e-9
+    coded_framebuffer: float = 0.48
+    coded_bits: float = 0.15
+    coded_entry_bytes: float = 3.7
     start_s: float = 2.0
     back_face_s: float = 5e-9
     lod_s: float = 6e-9

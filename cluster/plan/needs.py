@@ -9,7 +9,8 @@ from typing import Any
 from ...shared.messages import FRAMEBUFFER_EMPTY, RENDER_POINT
 from ...shared.pooled import PoolCounts
 from ..job import Job
-from ..topologies import FRAME_PARALLEL, SORT_LAST_ONLY, ranks_to_start
+from ..topologies import FRAME_PARALLEL, layout_of, ranks_to_start
+from ..wall import writes_screens
 from .costs import COSTS
 from .part import (
     ADAPTIVE,
@@ -19,6 +20,7 @@ from .part import (
     CLASSES,
     COLOUR,
     COLOUR_MAPS,
+    COMPRESSION,
     LAYERS,
     LEVEL_OF_DETAIL,
     MPI,
@@ -43,6 +45,7 @@ def parts(job: Job, work: Workload, decision: Decision) -> list[Part]:
         _mpi(decision),
         _delivery(job, decision),
         _compositing(job, work, decision),
+        _compression(job, work, decision),
         _back_face_test(job, work),
         _level_of_detail(job, work),
         _render_point_stride(job, work),
@@ -104,14 +107,64 @@ def _delivery(job: Job, decision: Decision) -> Part:
 
 
 def _compositing(job: Job, work: Workload, decision: Decision) -> Part:
-    sent = work.pixels * FRAMEBUFFER_EMPTY.nbytes
-    if decision.topology == SORT_LAST_ONLY:
-        others = ranks_to_start(job.config.pipeline, decision.topology) - 1
-        why = f"{others} ranks send rank 0 what they have drawn, at most this; background is not sent"
-        return Part("compositing", False, why, others * sent, "bytes/frame", "counted")
+    sent, unit = work.pixels * FRAMEBUFFER_EMPTY.nbytes, "bytes/frame"
     if decision.topology == FRAME_PARALLEL:
-        return Part("compositing", True, "a picture is drawn by one rank", sent, "bytes/frame", "counted")
-    return Part("compositing", True, "one render rank: no framebuffer is sent", sent, "bytes/frame", "counted")
+        return Part("compositing", True, "a picture is drawn by one rank", sent, unit, "counted")
+    pipeline = job.config.pipeline
+    layout = layout_of(pipeline, ranks_to_start(pipeline, decision.topology))
+    others = len(layout.render) - 1
+    if decision.topology == "single" or not others:
+        return Part("compositing", True, "one render rank: no framebuffer is sent", sent, unit, "counted")
+    if writes_screens(job, layout):
+        return Part("compositing", True, "wall.output is tiles: a screen is written by one rank", sent, unit, "counted")
+    if layout.split == "tiles":
+        sent *= others / len(layout.render)
+        why = f"{others} ranks send rank {layout.display} their tiles, at most this; background is not sent"
+    else:
+        sent *= others
+        why = f"{others} ranks send rank {layout.display} what they have drawn, at most this; background is not sent"
+    return Part("compositing", False, why, sent, unit, "counted")
+
+
+def _compression(job: Job, work: Workload, decision: Decision) -> Part:
+    """What coding takes of a frame's time, less what it saves on the links where those are configured."""
+    pipeline = job.config.pipeline
+    raw, coded, kinds = _coded_messages(job, work, decision)
+    spent_ms = 1e3 * COSTS.code_byte_s * raw
+    if decision.topology == "single" or not kinds:
+        why = "one rank: nothing is sent" if decision.topology == "single" else "no message of it has a coded form"
+        return Part(COMPRESSION, True, why, None, "ms/frame")
+    why = f"pipeline.compression is {pipeline.compression}: {kinds}, about {raw:,.0f} → {coded:,.0f} bytes a frame"
+    if pipeline.link_mb_per_s:
+        saved_ms = 1e-3 * (raw - coded) / pipeline.link_mb_per_s
+        why += f", would save {saved_ms:.3g} ms at pipeline.link_mb_per_s = {pipeline.link_mb_per_s:g}"
+        off = pipeline.compression == "off" or (pipeline.compression == "auto" and saved_ms <= spent_ms)
+        return Part(COMPRESSION, off, why, spent_ms - saved_ms, "ms/frame")
+    if pipeline.compression == "auto":
+        even = 1e-3 * (raw - coded) / spent_ms
+        why += f"; coded between hosts whose link is measured below about {even:,.0f} MB/s"
+    return Part(COMPRESSION, pipeline.compression == "off", why, spent_ms, "ms/frame")
+
+
+def _coded_messages(job: Job, work: Workload, decision: Decision) -> tuple[float, float, str]:
+    """Bytes of a frame's messages that have a coded form, at most; those coded, about; which they are."""
+    if decision.topology in ("single", FRAME_PARALLEL):
+        return 0.0, 0.0, ""
+    pipeline = job.config.pipeline
+    layout = layout_of(pipeline, ranks_to_start(pipeline, decision.topology))
+    raw = coded = 0.0
+    kinds = []
+    if any(lane.culling != lane.sampling or lane.sampling != lane.render for lane in layout.lanes):
+        raw = work.cells / 8 + RENDER_POINT.itemsize * work.entries
+        coded = COSTS.coded_bits * work.cells / 8 + COSTS.coded_entry_bytes * work.entries
+        kinds.append("visibility bits and render-points")
+    others = len(layout.render) - 1
+    if others:
+        pictures = others / len(layout.render) if layout.split == "tiles" else others
+        raw += pictures * work.pixels * FRAMEBUFFER_EMPTY.nbytes
+        coded += pictures * work.pixels * FRAMEBUFFER_EMPTY.nbytes * COSTS.coded_framebuffer
+        kinds.append("framebuffers")
+    return raw, coded, " and ".join(kinds)
 
 
 def _back_face_test(job: Job, work: Workload) -> Part:

@@ -10,6 +10,7 @@ LAYERS, PAGING = "layers", "paging of points"
 NO_NORMALS, BACK_FACE = "normals and back-face test", "back-face test"
 LEVEL_OF_DETAIL, SPLAT_LOOP, ADAPTIVE = "level of detail", "splat loop and attenuation", "adaptive point size"
 COLOUR, COLOUR_MAPS, CHECKSUMS = "colour column", "colour maps", "checksums"
+COMPRESSION = "compression of messages"
 CLASSES, BOXES = "class filter", "clip boxes"
 LIGHTING, DEPTHS, NORMALS = "eye-dome lighting", "depth pictures", "normal pictures"
 

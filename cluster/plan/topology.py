@@ -11,16 +11,14 @@ from __future__ import annotations
 import json
 import os
 from dataclasses import asdict, dataclass
-from typing import Literal
 
 from ...shared.messages import RENDER_POINT
 from ..job import Job
 from ..launch import mpi_available
-from ..topologies import FRAME_PARALLEL, SORT_LAST_ONLY, ranks_to_start
+from ..topologies import CHAIN, FRAME_PARALLEL, layout_of, ranks_to_start
+from ..wall import writes_screens
 from .costs import COSTS, UnitCosts, compose_core_s, draw_core_s
 from .workload import Workload
-
-Topology = Literal["single", "pipelined", "frame-parallel", "sort-last-only"]
 
 
 @dataclass(frozen=True)
@@ -46,7 +44,7 @@ class Estimate:
 class Decision:
     """The topology of a run and why; estimates where they decided."""
 
-    topology: Topology
+    topology: str
     reason: str
     estimate: Estimate | None = None
 
@@ -119,15 +117,24 @@ def decide(job: Job) -> Decision:
     return choose_topology(job, Workload.of_look(job))
 
 
-def _said(job: Job, topology: Topology) -> str:
+def _said(job: Job, topology: str) -> str:
     """What a topology does with any number of ranks; nothing for the others."""
-    ranks = ranks_to_start(job.config.pipeline, topology)
+    if topology in (*CHAIN, "single"):
+        return ""
+    pipeline = job.config.pipeline
+    ranks = ranks_to_start(pipeline, topology)
     if topology == FRAME_PARALLEL:
-        return f": each of {ranks} ranks opens the whole scene, and draws and writes whole pictures in turn"
-    if topology == SORT_LAST_ONLY:
-        share = job.scene.info.n_stored / ranks
-        return f": each of {ranks} ranks opens and draws about {share:,.0f} of the stored points; rank 0 composites"
-    return ""
+        film = "; rank 0 makes the film" if job.config.output.mp4 else ""
+        return f": each of {ranks} ranks opens the whole scene, and draws and writes whole pictures in turn{film}"
+    layout = layout_of(pipeline, ranks)
+    culling, sampling = (len({r for lane in layout.lanes for r in getattr(lane, s)}) for s in ("culling", "sampling"))
+    said = f": {ranks} ranks, {culling} cull, {sampling} sample, {len(layout.render)} render"
+    if layout.split == "shares":
+        share = job.scene.info.n_stored / len(layout.render)
+        return f"{said} about {share:,.0f} of the stored points each; rank {layout.display} composites"
+    if writes_screens(job, layout):
+        return f"{said} a screen of the wall each, and write it"
+    return said + (f" a tile each; rank {layout.display} has the picture" if layout.split == "tiles" else "")
 
 
 def _ms(seconds: float) -> str:

@@ -5,6 +5,7 @@
 ``edl``        eye-dome lighting: how dark each pixel gets
 ``colour``     words, shades and background → 8 or 16 bits a channel, several drawn pixels averaged into one
 ``surface``    depths and normals of a frame
+``wall``       screens cut out of a picture, mullions painted or left out
 ``rows``       compiled kernels over the rows of a frame, on several threads
 ``reference``  the short NumPy twins of the kernels
 

@@ -5,6 +5,8 @@ A *panel* is what is lit and averaged as a whole: the one view, each eye of a st
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -13,6 +15,7 @@ import numpy as np
 from ...shared.camera import Camera
 from ...shared.colour import frame_to_rgba
 from ...shared.messages import FRAMEBUFFER_EMPTY
+from ...shared.windows import Window
 
 
 @dataclass(frozen=True)
@@ -25,6 +28,7 @@ class PictureSettings:
     edl_strength, edl_radius_px : eye-dome lighting, pixels of the picture; strength 0: none.
     colours, depth, normals : which layers are wanted.
     threads : that compose.
+    screen : what is composed of a mono picture, pixels of it; None: all. What is within ``reach_px`` is looked at.
     """
 
     view: Literal["mono", "stereo", "panorama"]
@@ -40,6 +44,20 @@ class PictureSettings:
     depth: bool
     normals: bool
     threads: int
+    screen: Window | None = None
+
+    @property
+    def reach_px(self) -> int:
+        """How far from a pixel the words lie, at most, that it is composed of; pixels of the picture."""
+        if self.normals:
+            from .surface import LONGEST_RUN_PX
+
+            return max(2 * LONGEST_RUN_PX + 2, self._lit_px)
+        return self._lit_px
+
+    @property
+    def _lit_px(self) -> int:
+        return math.ceil(self.edl_radius_px) + 1 if self.edl_strength else 0
 
     @property
     def is_plain(self) -> bool:
@@ -59,6 +77,11 @@ class Picture:
     rgba: np.ndarray | None = None
     depth: np.ndarray | None = None
     normals: np.ndarray | None = None
+
+    def of_each(self, part: Callable[[np.ndarray], np.ndarray]) -> Picture:
+        """A picture of what a function makes of each layer."""
+        layers = (None if layer is None else part(layer) for layer in (self.rgba, self.depth, self.normals))
+        return Picture(*layers)
 
 
 class Composer:
@@ -114,6 +137,16 @@ class Composer:
 
     def _panel(self, words: np.ndarray, camera: Camera) -> Picture:
         s = self._settings
+        if s.screen is None:
+            return self._composed(words, camera, Window(0, 0, s.width, s.height))
+        around = s.screen.grown(s.reach_px, s.width, s.height)
+        part = np.ascontiguousarray(around.scaled(s.supersampling).of(words))
+        part.flags.writeable = False
+        return self._composed(part, camera, around).of_each(s.screen.seen_from(around).of)
+
+    def _composed(self, words: np.ndarray, camera: Camera, window: Window) -> Picture:
+        """The layers of a window of the panel, pixels of the picture, that the words are of."""
+        s = self._settings
         rgba = self._colours(words) if s.colours else None
         depth = normals = None
         if s.depth or s.normals:
@@ -123,7 +156,7 @@ class Composer:
             if s.normals:
                 panorama = s.view == "panorama"
                 rays = surface.Rays.of_panorama(s.width, s.height) if panorama else None
-                rays = rays or surface.Rays.of_camera(camera, s.supersampling)
+                rays = rays or surface.Rays.of_camera(camera, s.supersampling).within(window)
                 normals = surface.normals(depth, rays, self._rows)
         return Picture(rgba, depth if s.depth else None, normals)
 

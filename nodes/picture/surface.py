@@ -11,6 +11,7 @@ from numba import njit
 
 from ...shared.camera import Camera
 from ...shared.messages import FRAMEBUFFER_EMPTY
+from ...shared.windows import Window
 from .rows import Rows
 
 LONGEST_RUN_PX = 64
@@ -36,6 +37,11 @@ class Rays:
         columns = (np.arange(camera.width // supersampling) + 0.5) * supersampling
         rows = (np.arange(camera.height // supersampling) + 0.5) * supersampling
         return cls((columns - cx) / fx, np.full(len(columns), -1.0), (cy - rows) / fy, np.ones(len(rows)))
+
+    def within(self, window: Window) -> Rays:
+        """Those of a window of the picture."""
+        x0, y0, x1, y1 = window
+        return Rays(self.x[x0:x1], self.z[x0:x1], self.y[y0:y1], self.level[y0:y1])
 
     @classmethod
     def of_panorama(cls, width: int, height: int) -> Rays:

@@ -24,6 +24,10 @@ if TYPE_CHECKING:
 _LIBRARY = "libEGL.so.1"
 _VERSION = 450  # compute shaders came with 4.3; drivers take 64-bit atomics from GLSL 4.50 on
 _PROBE_S = 60
+_EGL_EXTENSIONS = 0x3055
+_MOST_DEVICES = 64
+_LOCAL_RANK = ("MPI_LOCALRANKID", "OMPI_COMM_WORLD_LOCAL_RANK", "SLURM_LOCALID")
+"""Number of a rank on its host, by MPICH, Open MPI, srun; the innermost starter first."""
 _FREE_MEMORY_KIB = {"GL_NVX_gpu_memory_info": 0x9049, "GL_ATI_meminfo": 0x87FC}  # extension → what to query
 
 
@@ -62,11 +66,14 @@ def is_software(renderer: str) -> bool:
 def open_context(device_index: int) -> moderngl.Context:
     """A context on an EGL device, current in this thread; the caller releases it.
 
-    device_index : in the order of EGL, which is not that of CUDA; GLCONTEXT_DEVICE_INDEX in the environment wins.
+    device_index : in the order of EGL, which is not that of CUDA; 0: that of this rank (``device_of_rank``).
+        GLCONTEXT_DEVICE_INDEX in the environment wins.
     Raises DeviceError: moderngl or a library is missing, no such device, or OpenGL is older than 4.5.
     """
     _check_installed()
     import moderngl
+
+    device_index = device_index or device_of_rank()
 
     # EGL hands out the functions of OpenGL as well, so libGL, which comes with X, is not needed
     libraries = {"libegl": _LIBRARY, "libgl": _LIBRARY}
@@ -76,6 +83,39 @@ def open_context(device_index: int) -> moderngl.Context:
     except Exception as error:  # the binding raises bare Exception
         index = os.environ.get("GLCONTEXT_DEVICE_INDEX", device_index)
         raise DeviceError(f"OpenGL: no OpenGL 4.5 on EGL device {index}: {error}") from error
+
+
+def device_of_rank() -> int:
+    """Index of the EGL device for this process: ranks of a host take its GPUs in turn, by their number there.
+
+    0 where there are not several GPUs, or no starter of ranks says a number. Cost: none for the first rank of a host.
+    """
+    numbers = (os.environ[name] for name in _LOCAL_RANK if os.environ.get(name, "").isdigit())
+    local_rank = int(next(numbers, 0))
+    if not local_rank:
+        return 0
+    gpus = hardware_devices()
+    return gpus[local_rank % len(gpus)] if len(gpus) > 1 else 0
+
+
+def hardware_devices() -> list[int]:
+    """Indices of the EGL devices that are no software; empty where EGL does not say.
+
+    A scheduler that confines a job to some GPUs leaves only those to EGL; CUDA_VISIBLE_DEVICES alone does not.
+    """
+    library = ctypes.CDLL(_LIBRARY)
+    library.eglGetProcAddress.restype = ctypes.c_void_p
+    query = library.eglGetProcAddress(b"eglQueryDevicesEXT")
+    describe = library.eglGetProcAddress(b"eglQueryDeviceStringEXT")
+    if not (query and describe):
+        return []
+    devices, n = (ctypes.c_void_p * _MOST_DEVICES)(), ctypes.c_int()
+    query_devices = ctypes.CFUNCTYPE(ctypes.c_uint, ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)(query)
+    string_of = ctypes.CFUNCTYPE(ctypes.c_char_p, ctypes.c_void_p, ctypes.c_int)(describe)
+    if not query_devices(_MOST_DEVICES, devices, ctypes.byref(n)):
+        return []
+    said = [string_of(devices[i], _EGL_EXTENSIONS) or b"" for i in range(n.value)]
+    return [i for i, extensions in enumerate(said) if b"EGL_MESA_device_software" not in extensions]
 
 
 class ContextOwner:

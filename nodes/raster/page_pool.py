@@ -21,8 +21,8 @@ ABSENT, LOADING = -1, -2
 """What ``PagePool.slot_of_page`` says of a page that is in no slot (yet)."""
 
 LOADERS = 8
-"""Threads that read pages, and mostly wait for the disk: 64 KiB at random places came at 170 MB/s to one of them, 340 to
-four, 550 to eight."""
+"""Threads that read pages, and mostly wait for the disk: 64 KiB at random places came at 170 MB/s to one of them, 340
+to four, 550 to eight."""
 
 
 class PagePool:

@@ -13,6 +13,7 @@ from functools import partial
 import numpy as np
 
 from ...shared.camera import Camera
+from ...shared.messages import points_of
 from . import PointSize, kernels
 from .blocks import Blocks
 from .cpu import PIECE_POINTS
@@ -65,7 +66,8 @@ class PagedCpuRasterizer(FramebufferRasterizer):
         self._blocks = Blocks(origin, np.full(len(origin), size.world), nothing, nothing)
         self._expected: deque[tuple[int, np.ndarray]] = deque()
         self._counted = self.pool.loaded_bytes, self.pool.n_evicted
-        self.residency = Residency(0.0, 0, 0)
+        self.residency = Residency()
+        self._found = 0, 0
 
     def expect(self, frame: int, entries: np.ndarray) -> None:
         """Say what a frame that follows those expected so far will draw, so that its pages are loaded meanwhile.
@@ -87,7 +89,7 @@ class PagedCpuRasterizer(FramebufferRasterizer):
             self._expected.popleft()
         words = self._draw_complete(camera, entries) if self._complete else self._draw_at_once(camera, entries)
         loaded, evicted = self.pool.loaded_bytes, self.pool.n_evicted
-        self.residency = Residency(self._missing, loaded - self._counted[0], evicted - self._counted[1])
+        self.residency = Residency(*self._found, loaded - self._counted[0], evicted - self._counted[1])
         self._counted = loaded, evicted
         return words
 
@@ -100,11 +102,11 @@ class PagedCpuRasterizer(FramebufferRasterizer):
         with self.pool.lock:
             cut = self._cutter.cut(entries, self.pool.slot_of_page, fallback=True)
             self.pool.need([cut.used, self._coarse_first(cut.missing), *self._pages_ahead()])
-        self._missing = cut.n_missing / max(cut.n_wanted, 1)
+        self._found = cut.n_wanted, cut.n_missing
         return self._draw_pieces(camera, cut)
 
     def _draw_complete(self, camera: Camera, entries: np.ndarray) -> np.ndarray:
-        self._missing = 0.0
+        self._found = int(points_of(entries).sum()), 0
         left, words = self._cutter.pages(entries), None
         while words is None or len(left):
             with self.pool.lock:

@@ -60,11 +60,18 @@ class PagedPoints:
 
 @dataclass(frozen=True)
 class Residency:
-    """What the last frame found. missing : share of its points that were not there, 0 … 1.
+    """What the last frame found.
 
+    wanted_points, missing_points : of its entries; of these, the ones that were not there.
     loaded_bytes, evicted_pages : read into the pool and dropped from it since the frame before.
     """
 
-    missing: float
-    loaded_bytes: int
-    evicted_pages: int
+    wanted_points: int = 0
+    missing_points: int = 0
+    loaded_bytes: int = 0
+    evicted_pages: int = 0
+
+    @property
+    def missing(self) -> float:
+        """Share of the points that were not there, 0 … 1."""
+        return self.missing_points / max(self.wanted_points, 1)

@@ -23,6 +23,9 @@ module               owns
 ``pooled``           the pooled form of cells that gain by it
 ``writer``           the scene directory: partial, checksums, rename
 ``builder``          ``build_scene``: the order of all this
+``shares``           inputs and partitions, dealt to ranks
+``ranks``            what several processes need of each other, steps that fail on all or none
+``on_ranks``         ``build_scene_on_ranks``: the same by several processes
 ===================  ==================================================================================
 """
 

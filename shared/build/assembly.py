@@ -14,6 +14,9 @@ from .sets import merge_areas, sample_inner, set_sizes
 from .subtree import LinkedCells, link
 
 _FIELDS = ("level", "code", "count", "first_point", "n_points")
+_LINKED = ("level", "code", "parent", "first_child", "n_children", "count", "start", "first_point", "n_points")
+_MADE: dict[str, tuple[int, ...]] = {"area": (), "normal_sum": (3,), "cone": (4,)}
+"""Fields of LinkedCells that may be None, and the shape of a cell's row: zeros stand for None."""
 
 
 class Assembly:
@@ -45,6 +48,37 @@ class Assembly:
         """
         self._parts.append(cells)
         self._root_sets.append(root_set)
+
+    def part(self) -> dict[str, np.ndarray]:
+        """The subtrees so far as arrays, for ``take`` in another process."""
+        arrays = {"n_cells": np.array([len(p) for p in self._parts], np.int64)}
+        if not self._parts:
+            return arrays
+        for name in _LINKED:
+            arrays[f"cell_{name}"] = np.concatenate([getattr(p, name) for p in self._parts])
+        for name, row in _MADE.items():
+            arrays[f"cell_{name}"] = np.concatenate([_or_zeros(getattr(p, name), (len(p), *row)) for p in self._parts])
+        if self._layered:
+            sets = concatenate([s.select(slice(0, self._capacity)) for s in self._root_sets])
+            arrays["n_set"] = np.array([min(len(s), self._capacity) for s in self._root_sets], np.int64)
+            arrays |= {"positions": sets.positions} | {f"attr_{a}": column for a, column in sets.attributes.items()}
+        return arrays
+
+    def take(self, part: dict[str, np.ndarray], first_point: int) -> None:
+        """Go on with what ``part`` gave, whose points are stored from ``first_point`` on."""
+        cuts = np.cumsum(part["n_cells"])[:-1]
+        if len(part["n_cells"]):
+            columns = zip(*(np.split(part[f"cell_{name}"], cuts) for name in (*_LINKED, *_MADE)), strict=True)
+            parts = [LinkedCells(*cells) for cells in columns]
+            for cells in parts:
+                cells.first_point += first_point
+            self._parts += parts
+        if len(part["n_cells"]) and self._layered:
+            attributes = {name[5:]: column for name, column in part.items() if name.startswith("attr_")}
+            sets, end = PointBatch(part["positions"], attributes), 0
+            for n in part["n_set"].tolist():
+                self._root_sets.append(sets.select(slice(end, end + n)))
+                end += n
 
     def append_top(self, array: PointArrayWriter, workers: Workers) -> None:
         """Make the cells above the partitions and append the sets they own."""
@@ -147,5 +181,5 @@ def _no_cells() -> LinkedCells:
     return LinkedCells(*([none] * 9))
 
 
-def _or_zeros(array: np.ndarray | None, shape: int | tuple[int, int]) -> np.ndarray:
+def _or_zeros(array: np.ndarray | None, shape: int | tuple[int, ...]) -> np.ndarray:
     return np.zeros(shape) if array is None else array

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,10 +26,17 @@ from .partition import Subdivision
 from .point_array import PointArrayWriter, block_level, block_levels_of
 from .pooled import pool_positions, suited_bits
 from .runs import Partition, Runs
-from .settings import BuildReport, BuildSettings, MemoryPlan, peak_resident_bytes, plan_memory
+from .settings import (
+    BuildReport,
+    BuildSettings,
+    MemoryPlan,
+    available_memory_bytes,
+    peak_resident_bytes,
+    plan_memory,
+)
 from .streamed import append_streamed_leaf
 from .subtree import build_subtree
-from .writer import SceneWriter, settings_json
+from .writer import ColumnFolder, SceneWriter, settings_json
 
 Progress = Callable[[str, int, int | None], None]
 
@@ -54,39 +62,64 @@ def build_scene(
     left behind then.
     Cost: O(n); each input is read once, twice if it does not fit into memory and states no bounds or wrong ones.
     """
-    return _Build(list(sources), Path(out), settings or BuildSettings(), progress or _silent).run()
+    return Build(list(sources), Path(out), settings or BuildSettings(), progress or silent).run()
 
 
-def _silent(stage: str, done: int, total: int | None) -> None:
-    pass
+def silent(stage: str, done: int, total: int | None) -> None:
+    """Progress that nobody looks at."""
 
 
-class _Build:
-    """One build: reading, partitions, the cells above them, ``scene.json``."""
+Arrays = dict[str, np.ndarray]
 
-    def __init__(self, sources: list[Source], out: Path, settings: BuildSettings, progress: Progress) -> None:
+
+@dataclass(frozen=True)
+class Finished:
+    """The cells of a scene whose points are all stored: name → array, the root cube, and the blocks."""
+
+    cells: Arrays
+    origin: np.ndarray
+    edge: float
+    block_first_point: np.ndarray
+    block_origin: np.ndarray
+
+
+class Build:
+    """One build: reading, partitions, the cells above them, ``scene.json``.
+
+    ranks_here : processes that build together on this host and share ``settings.memory_bytes``.
+    """
+
+    writer: ColumnFolder
+    workers: Workers
+
+    def __init__(
+        self, sources: list[Source], out: Path, settings: BuildSettings, progress: Progress, ranks_here: int = 1
+    ) -> None:
         if not sources:
             raise InputError("build: found no inputs, expected at least one")
         self.sources, self.out, self.settings, self.progress = sources, out, settings, progress
+        self.share = sources  # what this process reads of them
         self.read_attributes, self.attributes, self.dropped_attributes = planned_attributes(sources, settings)
         self.makes = set(self.attributes) - set(self.read_attributes)
-        self.memory: MemoryPlan = plan_memory(settings, self.attributes, bool(self.makes))
+        self.budget = settings  # with the memory of this process
+        if ranks_here > 1:
+            memory_bytes = settings.memory_bytes or available_memory_bytes() // 2
+            self.budget = replace(settings, memory_bytes=max(1, memory_bytes // ranks_here))
+        self.memory: MemoryPlan = plan_memory(self.budget, self.attributes, bool(self.makes))
         self.rule = Subdivision(settings.points_per_cell, settings.max_depth, settings.flatness)
         self.declared = declared_bounds(sources)
         self.stage_s: dict[str, float] = {}
 
     def run(self) -> BuildReport:
+        """The whole build."""
         with (
-            SceneWriter(self.out, overwrite=self.settings.overwrite) as self.writer,
+            SceneWriter(self.out, overwrite=self.settings.overwrite) as writer,
             Workers(self.settings.threads) as self.workers,
         ):
+            self.writer = writer
             with self.timed("read"):
                 held, runs, tally = self.read_all()
-                bounds = root_bounds(self.declared, tally)
-                origin, edge = root_cube(*bounds)
-            self.surface = self.surface_rule(origin, edge, bounds)
-            self.array = PointArrayWriter(self.writer, self.attributes, origin, edge)
-            self.assembly = Assembly(self.settings.point_order, self.settings.points_per_cell)
+            origin, edge = self.prepare(root_bounds(self.declared, tally))
             if runs is None:
                 assert held is not None
                 self.add_partition(held, keys_of(held.positions, origin, edge, self.workers), 0, 0, tally.n_points)
@@ -98,7 +131,22 @@ class _Build:
             with self.timed("write"):
                 self.assembly.append_top(self.array, self.workers)
             with self.timed("finish"):
-                info = self.finish(origin, edge, tally)
+                finished = self.finish_cells(writer, origin, edge, tally)
+                if self.settings.pools:
+                    finished.cells.update(self.pool(finished, [writer.written(axis) for axis in "xyz"]))
+                info = self.commit(writer, finished, tally)
+        return self.report(info, runs.bytes if runs else 0, peak_resident_bytes())
+
+    def prepare(self, bounds: Bounds) -> tuple[np.ndarray, float]:
+        """Open the point-array; (origin, edge) of the root cube."""
+        origin, edge = root_cube(*bounds)
+        self.surface = self.surface_rule(origin, edge, bounds)
+        self.array = PointArrayWriter(self.writer, self.attributes, origin, edge)
+        self.assembly = Assembly(self.settings.point_order, self.settings.points_per_cell)
+        return origin, edge
+
+    def report(self, info: SceneInfo, spilled_bytes: int, peak_bytes: int, n_ranks: int = 1) -> BuildReport:
+        """What has been done."""
         return BuildReport(
             path=self.out,
             n_points=info.n_points,
@@ -107,15 +155,17 @@ class _Build:
             n_dropped=info.n_dropped,
             dropped_attributes=self.dropped_attributes,
             n_partitions=self.assembly.n_partitions,
-            spilled_bytes=runs.bytes if runs else 0,
+            spilled_bytes=spilled_bytes,
             bytes=sum(array.bytes for array in info.arrays.values()),
             position_bytes=sum(info.arrays[name].bytes for name in info.position_arrays),
-            peak_bytes=peak_resident_bytes(),
+            peak_bytes=peak_bytes,
+            n_ranks=n_ranks,
             stage_s=self.stage_s,
         )
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
+        """Add the time that the block takes to a stage's."""
         start = time.perf_counter()
         yield
         self.stage_s[stage] = self.stage_s.get(stage, 0.0) + time.perf_counter() - start
@@ -123,20 +173,28 @@ class _Build:
     def read_all(self) -> tuple[PointBatch | None, Runs | None, Tally]:
         """The points in memory, or the runs that hold them."""
         held, runs, tally = self.read_with(self.declared)
+        self.check_found(tally)
         bounds = root_bounds(self.declared, tally)
         if runs is not None and bounds is not self.declared and not runs.built_for(*root_cube(*bounds)):
             runs.discard()  # the headers were wrong: once more, now that the bounds are known
             held, runs, tally = self.read_with(bounds)
         return held, runs, tally
 
-    def read_with(self, bounds: Bounds | None) -> tuple[PointBatch | None, Runs | None, Tally]:
-        promised = [source.info.n_points for source in self.sources]
+    def check_found(self, tally: Tally) -> None:
+        """Raise InputError where there are no points."""
+        if not tally.n_points:
+            raise InputError(f"{self.sources[0].info.path}: found no finite point, expected at least one")
+
+    def read_with(
+        self, bounds: Bounds | None, runs: Runs | None = None
+    ) -> tuple[PointBatch | None, Runs | None, Tally]:
+        """Read this process's share; into runs if they are given, or else if it does not fit into memory."""
+        promised = [source.info.n_points for source in self.share]
         expected = None if None in promised else sum(n for n in promised if n is not None)
         capacity = self.memory.capacity
         columns = Columns(capacity if expected is None else max(1, min(capacity, expected)), self.read_attributes)
-        runs: Runs | None = None
         tally = Tally()
-        for batch in finite_batches(self.sources, self.read_attributes, self.memory.batch, self.settings.strict, tally):
+        for batch in finite_batches(self.share, self.read_attributes, self.memory.batch, self.settings.strict, tally):
             while len(batch) > columns.room:
                 room = columns.room
                 columns.add(batch.select(slice(0, room)))
@@ -147,8 +205,6 @@ class _Build:
                 columns.clear()
             columns.add(batch)
             self.progress("read", tally.n_points, expected)
-        if not tally.n_points:
-            raise InputError(f"{self.sources[0].info.path}: found no finite point, expected at least one")
         if runs is None:
             return columns.points(), None, tally
         if columns.n_points:
@@ -156,17 +212,19 @@ class _Build:
         return None, runs, tally
 
     def new_runs(self, bounds: Bounds) -> Runs:
+        """No runs yet, to be sorted in the root cube of these bounds."""
         directory = self.writer.partial / "runs"
         return Runs(directory, self.read_attributes, *root_cube(*bounds), self.rule, self.workers)
 
     def measured_bounds(self) -> Bounds:
-        """Tight bounds by a pass over the positions alone."""
+        """Tight bounds of this process's share, by a pass over the positions alone."""
         tally = Tally()
-        for _ in finite_batches(self.sources, (), self.memory.batch, self.settings.strict, tally):
+        for _ in finite_batches(self.share, (), self.memory.batch, self.settings.strict, tally):
             self.progress("bounds", tally.n_points, None)
         return tally.lower, tally.upper
 
     def add_from_runs(self, runs: Runs, partition: Partition, n_total: int) -> None:
+        """Build a partition and append it. n_total : points that are going to be built, for the progress."""
         if partition.fits:
             with self.timed("load"):
                 points, keys = runs.load(partition)
@@ -184,6 +242,7 @@ class _Build:
             self.assembly.add(cells, root_set)
 
     def add_partition(self, points: PointBatch, keys: np.ndarray, level: int, code: int, n_total: int) -> None:
+        """Build the cell (level, code) of these points, and append them."""
         order = self.settings.point_order
         if self.surface:
             with self.timed("neighbours"):
@@ -223,13 +282,11 @@ class _Build:
             center=bounds[0] + (bounds[1] - bounds[0]) / 2,
         )
 
-    def finish(self, origin: np.ndarray, edge: float, tally: Tally) -> SceneInfo:
-        """Write the cells, the blocks and ``scene.json``, and put the scene in its place."""
+    def finish_cells(self, writer: SceneWriter, origin: np.ndarray, edge: float, tally: Tally) -> Finished:
+        """The cells, and what is made of them but for pools."""
         cells = self.assembly.cell_arrays("normal" in self.attributes)
         first, block_origin = self.array.blocks()
-        position_bytes = pool_bytes = pool_bits = 0
-        coded = self.settings.positions != "float32"
-        if coded:
+        if self.settings.positions != "float32":
             with self.timed("positions"):
                 cells |= code_positions(
                     cells,
@@ -240,40 +297,57 @@ class _Build:
                     float(np.max(tally.upper - tally.lower)),
                     self.settings,
                     self.memory.capacity,
-                    self.writer,
+                    writer,
                     self.workers,
                     lambda done, total: self.progress("positions", done, total),
                 )
-                position_bytes = int(cells["cell_position_bytes"].sum(dtype=np.int64))
         if self.settings.features:
             with self.timed("features"):
-                cells |= cell_features(cells, origin, edge, first, block_origin, self.writer.written, self.workers)
-        if self.settings.pools:
-            with self.timed("pools"):
-                pool_bits = self.settings.pool_bits or suited_bits(self.settings.points_per_cell)
-                x, y, z = (self.writer.written(name) for name in "xyz")
-                cells |= pool_positions(
-                    cells,
-                    origin,
-                    edge,
-                    first,
-                    block_origin,
-                    lambda begin, end: (x[begin:end], y[begin:end], z[begin:end]),
-                    pool_bits,
-                    self.settings,
-                    self.writer,
-                    self.workers,
-                    lambda done, total: self.progress("pools", done, total),
-                )
-                pool_bytes = int(cells["cell_pool_bytes"].sum(dtype=np.int64))
+                cells |= cell_features(cells, origin, edge, first, block_origin, writer.written, self.workers)
+        return Finished(cells, origin, edge, first, block_origin)
+
+    def pool(self, finished: Finished, columns: list[np.ndarray], share: tuple[int, int] = (0, 1)) -> Arrays:
+        """Write the pooled form of a share of the cells; what it adds to them. columns : x, y and z of all points."""
+        x, y, z = columns
+        with self.timed("pools"):
+            return pool_positions(
+                finished.cells,
+                finished.origin,
+                finished.edge,
+                finished.block_first_point,
+                finished.block_origin,
+                lambda begin, end: (x[begin:end], y[begin:end], z[begin:end]),
+                self.pool_bits,
+                self.budget,
+                self.writer,
+                self.workers,
+                lambda done, total: self.progress("pools", done, total),
+                share=share,
+            )
+
+    @property
+    def pool_bits(self) -> int:
+        """Bits an axis of the pooled form's grid; 0 without one."""
+        if not self.settings.pools:
+            return 0
+        return self.settings.pool_bits or suited_bits(self.settings.points_per_cell)
+
+    def commit(self, writer: SceneWriter, finished: Finished, tally: Tally) -> SceneInfo:
+        """Write the cells, the blocks and ``scene.json``, and put the scene in its place."""
+        cells, first = finished.cells, finished.block_first_point
+        coded = self.settings.positions != "float32"
         for axis in "xyz" if coded else "":
-            self.writer.drop(axis)
-        for name, values in {**cells, "block_first_point": first, "block_origin": block_origin}.items():
-            self.writer.write_array(name, values)
+            writer.drop(axis)
+        for name, values in {**cells, "block_first_point": first, "block_origin": finished.block_origin}.items():
+            writer.write_array(name, values)
+
+        def bytes_of(name: str) -> int:
+            return int(cells[name].sum(dtype=np.int64)) if name in cells else 0
+
         info = SceneInfo(
             point_order=self.settings.point_order,
-            origin=_triple(origin),
-            edge=edge,
+            origin=_triple(finished.origin),
+            edge=finished.edge,
             lower=_triple(tally.lower),
             upper=_triple(tally.upper),
             n_points=tally.n_points,
@@ -285,9 +359,9 @@ class _Build:
             features=self.settings.features,
             positions=self.settings.positions,
             position_bits=self.settings.position_bits if coded else 0,
-            position_bytes=position_bytes,
-            pool_bits=pool_bits,
-            pool_bytes=pool_bytes,
+            position_bytes=bytes_of("cell_position_bytes"),
+            pool_bits=self.pool_bits,
+            pool_bytes=bytes_of("cell_pool_bytes"),
             block_levels=block_levels_of(self.settings.point_order, self.settings.points_per_cell),
             up=self.settings.up,
             crs=next((s.info.crs for s in self.sources if s.info.crs), None),
@@ -296,9 +370,9 @@ class _Build:
                 for source, n in zip(self.sources, tally.source_points, strict=True)
             ),
             build=settings_json(self.settings),
-            arrays=self.writer.close_columns(),
+            arrays=writer.close_columns(),
         )
-        self.writer.commit(info)
+        writer.commit(info)
         return info
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from itertools import pairwise
 from typing import Any
 
@@ -26,8 +26,17 @@ class Workers:
         self._pool.shutdown(cancel_futures=True)
 
     def map(self, task: Callable[..., Any], arguments: Iterable[tuple]) -> list[Any]:
-        """``task(*a)`` for each a, in any order; results in order. Raises the first task's exception."""
-        return [f.result() for f in [self._pool.submit(task, *a) for a in arguments]]
+        """``task(*a)`` for each a, in any order; results in order. Raises the first task's exception.
+
+        No task goes on behind the caller's back: those that have not started then are left out, others awaited.
+        """
+        futures = [self._pool.submit(task, *a) for a in arguments]
+        try:
+            return [f.result() for f in futures]
+        finally:
+            for future in futures:
+                future.cancel()
+            wait(futures)
 
     def ranges(self, n: int, *, pieces: int | None = None) -> list[tuple[int, int]]:
         """[0, n) in at most ``pieces`` (one per thread) contiguous non-empty ranges of nearly equal length."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 from numba import njit
@@ -11,8 +12,10 @@ from ..octree import cell_centers
 from ..points import ATTRIBUTES, RADIUS_STEPS, PointBatch
 from .parallel import Workers
 from .subtree import LinkedCells
-from .writer import SceneWriter, writing
+from .writer import ColumnFile, ColumnFolder, writing
 
+POINT_ARRAY_PART = ("n_stored", "block_first", "block_origin", "block_ends", "columns")
+"""What ``PointArrayWriter.part`` gives."""
 _CHUNK = 1 << 18
 _LAYERED_BLOCK_POINTS = 1024
 _DEPTH_FIRST_BLOCK_POINTS = 2048
@@ -28,6 +31,11 @@ def block_levels_of(point_order: str, points_per_cell: int) -> int:
     while point_order == "layered" and points_per_cell / 2 * 4**levels < _LAYERED_BLOCK_POINTS:
         levels += 1
     return levels
+
+
+def least_partition(point_order: str, points_per_cell: int) -> int:
+    """The fewest points for which cells that hold more are divided into partitions: no block is larger."""
+    return max(2 * points_per_cell, 0 if point_order == "layered" else _DEPTH_FIRST_BLOCK_POINTS)
 
 
 def block_level(cells: LinkedCells, point_order: str, points_per_cell: int) -> np.ndarray:
@@ -88,7 +96,7 @@ class PointArrayWriter:
     Each file is one task: it gathers, writes and sums up its own bytes in order, side by side with the others.
     """
 
-    def __init__(self, writer: SceneWriter, attributes: tuple[str, ...], origin: np.ndarray, edge: float) -> None:
+    def __init__(self, writer: ColumnFolder, attributes: tuple[str, ...], origin: np.ndarray, edge: float) -> None:
         self.n_stored = 0
         self.attributes = attributes
         self._writer = writer
@@ -97,7 +105,7 @@ class PointArrayWriter:
         self._columns = {a: writer.open_column(f"attr_{a}", ATTRIBUTES[a]) for a in attributes}
         self._block_first: list[np.ndarray] = []
         self._block_origin: list[np.ndarray] = []
-        self._last_block = (-1, -1)
+        self._first_block = self._last_block = (-1, -1)  # (level, code)
 
     def append(
         self,
@@ -139,6 +147,8 @@ class PointArrayWriter:
         first = (np.cumsum(n_points) - n_points)[starts]
         origin = cell_centers(self._origin, self._edge, block_level[starts], block_code[starts].astype(np.uint64))
         blocks = list(zip(block_level[starts].tolist(), block_code[starts].tolist(), strict=True))
+        if not self._block_first:
+            self._first_block = blocks[0]
         known = int(blocks[0] == self._last_block)  # goes on from the last call
         self._block_first.append(first[known:] + self.n_stored)
         self._block_origin.append(origin[known:])
@@ -164,4 +174,44 @@ class PointArrayWriter:
 
     def blocks(self) -> tuple[np.ndarray, np.ndarray]:
         """((b,) int64 first point, (b, 3) float64 origin) of all blocks so far."""
-        return np.concatenate(self._block_first), np.concatenate(self._block_origin)
+        none = np.zeros(0, np.int64), np.zeros((0, 3))
+        return np.concatenate([none[0], *self._block_first]), np.concatenate([none[1], *self._block_origin])
+
+    def part(self) -> dict[str, np.ndarray]:
+        """What has been appended, but for the files, as arrays, for ``go_on`` in another process."""
+        first, origin = self.blocks()
+        return {
+            "n_stored": np.array(self.n_stored),
+            "block_first": first,
+            "block_origin": origin,
+            "block_ends": np.array([self._first_block, self._last_block]),
+            "columns": np.array([file.part for file in self._files()]),
+        }
+
+    def abandon(self) -> None:
+        """Close the files, so that other processes may write behind what is in them."""
+        for file in self._files():
+            file.abandon()
+
+    def copy_into(self, directory: Path, first_point: int) -> None:
+        """Copy all points, behind which no more come, into the files of another writer, from ``first_point`` on."""
+        with writing(directory):
+            for file in self._files():
+                file.copy_into(directory / file.path.name, first_point)
+
+    def go_on(self, parts: list[dict[str, np.ndarray]]) -> None:
+        """After ``abandon``: take over the points that other processes have copied behind, in the order of parts."""
+        with writing(self._writer.partial):
+            for i, file in enumerate(self._files()):
+                file.go_on([part["columns"][i].tolist() for part in parts])
+        for part in parts:
+            if part["n_stored"]:
+                first, last = map(tuple, part["block_ends"].tolist())
+                known = int(first == self._last_block)
+                self._block_first.append(part["block_first"][known:] + self.n_stored)
+                self._block_origin.append(part["block_origin"][known:])
+                self._last_block = last
+                self.n_stored += int(part["n_stored"])
+
+    def _files(self) -> list[ColumnFile]:
+        return [*self._xyz, *self._columns.values()]

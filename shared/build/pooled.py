@@ -12,7 +12,8 @@ from ..octree import cell_centers
 from ..pooled import LEAST_POINTS, CellGrid, points_of
 from .parallel import Workers
 from .settings import BuildSettings, available_memory_bytes, resident_bytes
-from .writer import SceneWriter, writing
+from .shares import consecutive
+from .writer import ColumnFolder, writing
 
 LONGEST = 12
 """Translations looked for, along an axis. Longer ones changed the bytes of pools by at most 3 % on three scans and the
@@ -55,14 +56,17 @@ def pool_positions(
     columns: Callable[[int, int], Iterable[np.ndarray]],
     bits: int,
     settings: BuildSettings,
-    writer: SceneWriter,
+    writer: ColumnFolder,
     workers: Workers,
     progress: Callable[[int, int], None],
+    *,
+    share: tuple[int, int] = (0, 1),
 ) -> dict[str, np.ndarray]:
     """Write ``pool_codes``; the new cell arrays ``cell_pool_points`` and ``cell_pool_bytes``.
 
     columns : x, y, z of a range of the points as they will be read from the scene.
     progress : called with the points done, and in all.
+    share : (rank, ranks) among which consecutive cells are shared; the arrays are zero for those of other ranks.
     Cost: 2 to 4 µs a point and core, more where points are few for the grid. Memory: cells at the same time on as many
     threads as ``settings.memory_bytes`` has room for, one at least.
     """
@@ -71,6 +75,7 @@ def pool_positions(
     owns = count > 0 if settings.point_order == "layered" else cells["cell_first_child"] < 0
     tried = np.flatnonzero(owns & (count >= LEAST_POINTS))
     tried = tried[np.argsort(first[tried])]
+    tried = tried[consecutive(count[tried], *share)]
     edges = np.ldexp(edge, -level.astype(np.int64))
     lower = cell_centers(origin, edge, level, cells["cell_code"]) - edges[:, None] / 2
     blocks = np.searchsorted(block_first_point, first, side="right") - 1

@@ -73,9 +73,9 @@ class Runs:
         self._origin, self._edge = origin, edge
         self._rule = rule
         self._workers = workers
-        self._n_runs = 0
-        self._counts = np.zeros(_N_BUCKETS, np.int64)
-        self._moments = np.zeros((_N_BUCKETS, N_MOMENTS), np.int64) if rule.flatness > 0 else None
+        self._runs: list[Path] = []
+        self.counts = np.zeros(_N_BUCKETS, np.int64)
+        self.moments = np.zeros((_N_BUCKETS, N_MOMENTS), np.int64) if rule.flatness > 0 else None
         self._ahead: dict[tuple[int, int], np.ndarray] = {}
         self._released = 0
         self.bytes = 0
@@ -86,19 +86,17 @@ class Runs:
         """Sort points and write them as a run. Memory: 12 bytes a point and a chunk a column."""
         keys = self.keys(points)
         ids, first = sort_into_buckets(keys, BUCKET_LEVEL, 0, _N_BUCKETS, self._workers)
-        self._counts += np.diff(first)
-        if self._moments is not None:
+        self.counts += np.diff(first)
+        if self.moments is not None:
             pieces = self._workers.ranges(_N_BUCKETS)
-            self._workers.map(
-                bucket_moments, [(keys, ids, first, a, b, BUCKET_LEVEL, self._moments) for a, b in pieces]
-            )
-        run = self._n_runs
+            self._workers.map(bucket_moments, [(keys, ids, first, a, b, BUCKET_LEVEL, self.moments) for a, b in pieces])
+        run = self._directory / f"{len(self._runs):05d}"
         with writing(self._directory):
-            with open(self._file(run, "first"), "wb", buffering=0) as file:
+            with open(_file(run, "first"), "wb", buffering=0) as file:
                 write_all(file, first)
             columns = {"positions": points.positions, **points.attributes}
             self._workers.map(self._write_column, [(run, name, column, ids) for name, column in columns.items()])
-        self._n_runs += 1
+        self._runs.append(run)
         self.bytes += first.nbytes + sum(column.nbytes for column in columns.values())
 
     def built_for(self, origin: np.ndarray, edge: float) -> bool:
@@ -111,6 +109,19 @@ class Runs:
             file.unlink()
         self._directory.rmdir()
 
+    @property
+    def n_runs(self) -> int:
+        """Runs so far."""
+        return len(self._runs)
+
+    def read_on(self, directories: list[tuple[Path, int]], counts: np.ndarray, moments: np.ndarray | None) -> None:
+        """From now on read the runs of several processes, in this order: (directory, number of runs) of each.
+
+        counts, moments : of all of them, as these are.
+        """
+        self._runs = [directory / f"{run:05d}" for directory, n_runs in directories for run in range(n_runs)]
+        self.counts, self.moments = counts, moments
+
     def release_before(self, partition: Partition) -> None:
         """Give back the disk space of all points in front of the bucket that a partition begins in."""
         begin, _ = _buckets(partition.level, partition.code)
@@ -118,12 +129,12 @@ class Runs:
             return
         for run, start, stop in self._slices(self._released, begin):
             for name, row_bytes in (("positions", 24), *((a, ATTRIBUTES[a].itemsize) for a in self.attributes)):
-                punch_hole(self._file(run, name), start * row_bytes, (stop - start) * row_bytes)
+                punch_hole(_file(run, name), start * row_bytes, (stop - start) * row_bytes)
         self._released = begin
 
-    def _write_column(self, run: int, name: str, column: np.ndarray, ids: np.ndarray) -> None:
+    def _write_column(self, run: Path, name: str, column: np.ndarray, ids: np.ndarray) -> None:
         out = np.empty((_CHUNK, *column.shape[1:]), column.dtype)
-        with open(self._file(run, name), "wb", buffering=0) as file:
+        with open(_file(run, name), "wb", buffering=0) as file:
             for begin in range(0, len(ids), _CHUNK):
                 end = min(begin + _CHUNK, len(ids))
                 if column.ndim == 2:
@@ -132,18 +143,17 @@ class Runs:
                     np.take(column, ids[begin:end], out=out[: end - begin], mode="clip")
                 write_all(file, out[: end - begin])
 
-    def _file(self, run: int, name: str) -> Path:
-        return self._directory / f"{run:05d}.{name}"
-
-    def partitions(self, capacity: int) -> Iterator[Partition]:
+    def partitions(self, capacity: int, wanted: int | None = None) -> Iterator[Partition]:
         """Cells in Morton order that hold all points, each of at most ``capacity`` points or an oversize leaf.
 
+        wanted : cells of more points than this, at most ``capacity``, are partitions only if they are leaves.
         Cost: where a cell of the bucket level is oversize, a pass over its points for every three levels below.
         """
+        wanted = capacity if wanted is None else wanted
         first = np.zeros(_N_BUCKETS + 1, np.int64)
-        np.cumsum(self._counts, out=first[1:])
-        cells = upper_cells(0, 0, first, self._moments, self._rule)
-        oversize = cells.take(np.flatnonzero(cells.count > capacity))
+        np.cumsum(self.counts, out=first[1:])
+        cells = upper_cells(0, 0, first, self.moments, self._rule)
+        oversize = cells.take(np.flatnonzero(cells.count > wanted))
         split = dict(
             zip(zip(oversize.level.tolist(), oversize.code.tolist(), strict=True), oversize.split, strict=True)
         )
@@ -156,13 +166,13 @@ class Runs:
                 n = self._count(level, code)
             if n == 0:
                 return
-            if n <= capacity:
+            if n <= wanted:
                 yield Partition(level, code, n, fits=True)
             elif split[level, code] if width >= 0 else self._splits(level, code, n):
                 for octant in range(8):
                     yield from below(level + 1, code << 3 | octant)
             else:
-                yield Partition(level, code, n, fits=False)
+                yield Partition(level, code, n, fits=n <= capacity)
 
         yield from below(0, 0)
 
@@ -224,7 +234,7 @@ class Runs:
         """(begin, end, points) of consecutive buckets: together at most a chunk, or a single one with points."""
         first, n = begin, 0
         for bucket in range(begin, end):
-            here = int(self._counts[bucket])
+            here = int(self.counts[bucket])
             if n and n + here > _CHUNK:
                 yield first, bucket, n
                 n = 0
@@ -238,15 +248,15 @@ class Runs:
         """(n,) int64 Morton keys."""
         return keys_of(points.positions, self._origin, self._edge, self._workers)
 
-    def _slices(self, begin: int, end: int) -> list[tuple[int, int, int]]:
+    def _slices(self, begin: int, end: int) -> list[tuple[Path, int, int]]:
         """(run, start, stop) of the buckets [begin, end) in every run."""
 
-        def offset(run: int, bucket: int) -> int:
-            return int(np.fromfile(self._file(run, "first"), "<i8", 1, offset=8 * bucket)[0])
+        def offset(run: Path, bucket: int) -> int:
+            return int(np.fromfile(_file(run, "first"), "<i8", 1, offset=8 * bucket)[0])
 
-        return [(run, offset(run, begin), offset(run, end)) for run in range(self._n_runs)]
+        return [(run, offset(run, begin), offset(run, end)) for run in self._runs]
 
-    def _stream_slices(self, slices: list[tuple[int, int, int]], attributes: tuple[str, ...]) -> Iterator[PointBatch]:
+    def _stream_slices(self, slices: list[tuple[Path, int, int]], attributes: tuple[str, ...]) -> Iterator[PointBatch]:
         for run, start, stop in slices:
             for begin in range(start, stop, _CHUNK):
                 yield self._read_slices([(run, begin, min(begin + _CHUNK, stop))], attributes)
@@ -254,29 +264,33 @@ class Runs:
     def _read_buckets(self, begin: int, end: int, attributes: tuple[str, ...]) -> PointBatch:
         return self._read_slices(self._slices(begin, end), attributes)
 
-    def _read_slices(self, slices: list[tuple[int, int, int]], attributes: tuple[str, ...]) -> PointBatch:
+    def _read_slices(self, slices: list[tuple[Path, int, int]], attributes: tuple[str, ...]) -> PointBatch:
         points = Columns(sum(stop - start for _, start, stop in slices), attributes).whole()
         columns = {"positions": points.positions, **points.attributes}
         self._workers.map(self._read_column, [(name, slices, column) for name, column in columns.items()])
         return points
 
-    def _read_column(self, name: str, slices: list[tuple[int, int, int]], out: np.ndarray) -> None:
+    def _read_column(self, name: str, slices: list[tuple[Path, int, int]], out: np.ndarray) -> None:
         at = 0
         for run, start, stop in slices:
             self._read(run, name, start, stop, out[at : at + stop - start])
             at += stop - start
 
-    def _read(self, run: int, name: str, start: int, stop: int, out: np.ndarray) -> None:
+    def _read(self, run: Path, name: str, start: int, stop: int, out: np.ndarray) -> None:
         """Fill ``out``, C-contiguous, with rows [start, stop) of a run's column."""
         if stop > start:
             data = out.reshape(-1).view(np.uint8).data
-            with open(self._file(run, name), "rb", buffering=0) as file:
+            with open(_file(run, name), "rb", buffering=0) as file:
                 file.seek(start * (out.nbytes // len(out)))
                 while data:
                     n_read = file.readinto(data)
                     if not n_read:
                         raise OSError(f"{file.name}: ended early")
                     data = data[n_read:]
+
+
+def _file(run: Path, name: str) -> Path:
+    return run.with_name(f"{run.name}.{name}")
 
 
 def _buckets(level: int, code: int) -> tuple[int, int]:

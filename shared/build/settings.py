@@ -105,8 +105,8 @@ class BuildReport:
     n_partitions : subtrees that were built one after the other; 1 if the input fitted into memory.
     spilled_bytes : written to sorted runs and read again; 0 if the input fitted into memory.
     bytes : of the scene's arrays.  position_bytes : of those that hold positions.
-    peak_bytes : most memory the process held so far.
-    stage_s : seconds in each stage.
+    peak_bytes : most memory the process held so far, or one of the ``n_ranks`` that built together.
+    stage_s : seconds in each stage; of rank 0.
     """
 
     path: Path
@@ -120,6 +120,7 @@ class BuildReport:
     bytes: int
     position_bytes: int
     peak_bytes: int
+    n_ranks: int = 1
     stage_s: dict[str, float] = field(default_factory=dict)
 
 

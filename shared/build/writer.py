@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
+import math
 import os
 import shutil
 import zlib
@@ -13,8 +15,9 @@ from typing import IO, Any
 
 import numpy as np
 
-from ..errors import InputError
-from ..files import disk_error
+from ..crc import crc32_combine
+from ..errors import InputError, SplatpipeError
+from ..files import DISK_FULL, disk_error
 from ..scene_info import SCENE_FILE, ArrayInfo, SceneInfo
 
 
@@ -62,7 +65,11 @@ class ColumnFile:
 
     def written(self) -> np.ndarray:
         """The rows so far: a read-only map."""
-        return np.memmap(self.path, self.dtype, "r", self._data_offset, (self._rows, *self._row_shape))
+        return self.map_of(self.path, self._rows)
+
+    def map_of(self, path: Path, rows: int) -> np.ndarray:
+        """So many rows of another such file, perhaps without its final header: a read-only map."""
+        return np.memmap(path, self.dtype, "r", self._data_offset, (rows, *self._row_shape))
 
     def rename(self, name: str) -> None:
         """Go on under another name."""
@@ -81,8 +88,79 @@ class ColumnFile:
         """Close the file as it is."""
         self._file.close()
 
+    @property
+    def part(self) -> tuple[int, int]:
+        """(rows, CRC) so far, for ``go_on`` of the file that they are copied behind."""
+        return self._rows, self._crc
 
-class SceneWriter:
+    def copy_into(self, path: Path, row: int) -> None:
+        """Copy the rows, their file closed, to row ``row`` of the ``.npy`` file of such rows at ``path``."""
+        self.close()
+        width = self.dtype.itemsize * math.prod(self._row_shape)
+        with open(self.path, "rb", buffering=0) as source, open(path, "r+b", buffering=0) as target:
+            at, to, left = self._data_offset, self._data_offset + row * width, self._rows * width
+            while left:
+                copied = _copy_range(source.fileno(), target.fileno(), left, at, to)
+                at, to, left = at + copied, to + copied, left - copied
+
+    def go_on(self, parts: Iterable[tuple[int, int]]) -> None:
+        """Open an abandoned file again behind what other processes have copied to its end, in the order of ``parts``.
+
+        Raises SplatpipeError if the file is not as long as they say.
+        """
+        width = self.dtype.itemsize * math.prod(self._row_shape)
+        for rows, crc in parts:
+            self._crc = crc32_combine(self._crc, crc, rows * width)
+            self._rows += rows
+        self._file = open(self.path, "r+b", buffering=0)  # noqa: SIM115 - closed by close()
+        found, expected = self._file.seek(0, os.SEEK_END), self._data_offset + self._rows * width
+        if found != expected:
+            raise SplatpipeError(f"{self.path}: found {found} bytes that the ranks wrote, expected {expected}")
+
+
+_COPY_BYTES = 1 << 24
+
+
+def _copy_range(source: int, target: int, n_bytes: int, at: int, to: int) -> int:
+    """Copy at most ``n_bytes`` from one file to another; how many. Inside the kernel, where it can."""
+    try:
+        copied = os.copy_file_range(source, target, n_bytes, at, to)
+    except OSError as error:
+        if error.errno in DISK_FULL:
+            raise
+        copied = os.pwrite(target, os.pread(source, min(n_bytes, _COPY_BYTES), at), to)
+    if not copied:
+        raise OSError(errno.EIO, "a part of the scene ended early")
+    return copied
+
+
+class ColumnFolder:
+    """Growing arrays in a folder; a context manager, which closes them."""
+
+    def __init__(self, partial: Path) -> None:
+        self.partial = partial
+        self.columns: dict[str, ColumnFile] = {}
+
+    def __enter__(self) -> ColumnFolder:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for column in self.columns.values():
+            column.abandon()
+
+    def open_column(self, name: str, dtype: np.dtype, row_shape: tuple[int, ...] = ()) -> ColumnFile:
+        """A new growing array."""
+        with writing(self.partial):
+            self.columns[name] = ColumnFile(self.partial, name, dtype, row_shape)
+        return self.columns[name]
+
+
+def partial_folder(out: Path) -> Path:
+    """Where a scene is written before it is whole."""
+    return out.with_name(f".{out.name}.partial")
+
+
+class SceneWriter(ColumnFolder):
     """Owns ``.OUT.partial`` from the start of a build to the rename; a context manager.
 
     A killed build leaves only that directory, which the next build of the same scene removes: it starts clean.
@@ -94,11 +172,10 @@ class SceneWriter:
     """
 
     def __init__(self, out: Path, *, overwrite: bool) -> None:
+        super().__init__(partial_folder(out))
         self.out = out
-        self.partial = out.with_name(f".{out.name}.partial")
         self._replaced = out.with_name(f".{out.name}.replaced")
         self._overwrite = overwrite
-        self.columns: dict[str, ColumnFile] = {}
         check_target(out, overwrite)
 
     def __enter__(self) -> SceneWriter:
@@ -129,17 +206,10 @@ class SceneWriter:
                 self._replaced.rename(self.out)
 
     def __exit__(self, *_: object) -> None:
-        for column in self.columns.values():
-            column.abandon()
+        super().__exit__()
         if self.partial.exists():
             shutil.rmtree(self.partial, ignore_errors=True)
         os.close(self._lock)
-
-    def open_column(self, name: str, dtype: np.dtype, row_shape: tuple[int, ...] = ()) -> ColumnFile:
-        """A new growing array of the scene."""
-        with writing(self.partial):
-            self.columns[name] = ColumnFile(self.partial, name, dtype, row_shape)
-        return self.columns[name]
 
     def write_array(self, name: str, array: np.ndarray) -> None:
         """A whole array of the scene."""

@@ -6,6 +6,7 @@ yield ``PointBatch``es in file order. Whatever is wrong with a file becomes one 
 ==========  ====================================================================================
 inputs      paths, globs and directories → files; which format a file is in
 source      ``SourceInfo``, ``Source``; checks of promised counts; library failures → InputError
+described   sources that another process has opened
 columns     named columns → batches: which names mean what, ranges of colours
 records     fixed-size binary records (LAS, binary PLY and PCD, NPY)
 rows        rows of decimal numbers (text, ASCII PLY and PCD), compiled

@@ -185,8 +185,14 @@ class TableSource(Source):
         return next(self._tables(SAMPLE_POINTS, columns), {name: np.empty(0) for name in columns})
 
     def _read(self, max_points: int, attributes: tuple[str, ...]) -> Iterator[PointBatch]:
-        columns = {*self._positions, *(name for a in attributes for name in self._columns[a])}
-        for table in self._tables(max_points, columns):
+        return self._batches_of(self._tables(max_points, self._columns_of(attributes)), attributes)
+
+    def _columns_of(self, attributes: tuple[str, ...]) -> set[str]:
+        """The columns that positions and attributes are made of."""
+        return {*self._positions, *(name for a in attributes for name in self._columns[a])}
+
+    def _batches_of(self, tables: Iterator[Table], attributes: tuple[str, ...]) -> Iterator[PointBatch]:
+        for table in tables:
             positions = np.empty((len(table[self._positions[0]]), 3))
             for axis, name in enumerate(self._positions):
                 positions[:, axis] = table[name]

@@ -20,7 +20,7 @@ from numba import njit
 from ..errors import InputError
 from ..points import ATTRIBUTES, PointBatch
 from .columns import ColourRange
-from .laz import LazRecords
+from .laz import PART_CHUNK_POINTS, LazChunks, LazRecords, has_chunks
 from .records import BLOCK_POINTS, Records, sample_records
 from .source import Source, SourceInfo, check_promise, foreign_errors
 
@@ -59,6 +59,10 @@ class LasSource(Source):
                 upper=np.array(header.maxs, np.float64),
                 crs=_well_known_text(header),
             )
+            if not header.are_points_compressed:
+                self.part_points = 1
+            elif has_chunks(header):
+                self.part_points = PART_CHUNK_POINTS
 
     def _records(
         self, path: Path, file: BinaryIO, attributes: Collection[str], *, parallel: bool
@@ -68,21 +72,34 @@ class LasSource(Source):
         return Records(path, file, self._header.offset_to_point_data, self._dtype)
 
     def _read(self, max_points: int, attributes: tuple[str, ...]) -> Iterator[PointBatch]:
-        n_points = self._header.point_count
         with self.info.path.open("rb") as file:
             records = self._records(self.info.path, file, attributes, parallel=True)
-            # lazrs works on the chunks of one call in parallel, so it is given a whole batch at a time
-            step = max_points if isinstance(records, LazRecords) else BLOCK_POINTS
-            buffer = np.empty(min(step, max_points, n_points), self._dtype)
-            for first in range(0, n_points, max_points):
-                n = min(max_points, n_points - first)
-                batch = PointBatch(np.empty((n, 3)), {a: np.empty(n, ATTRIBUTES[a]) for a in attributes})
-                for i in range(0, n, len(buffer)):
-                    block = buffer[: n - i]
-                    records.read_into(block)
-                    for j in range(0, len(block), BLOCK_POINTS):
-                        self._unpack(block[j : j + BLOCK_POINTS], batch, i + j)
-                yield batch
+            yield from self._batches(records, self._header.point_count, max_points, attributes)
+
+    def _read_part(self, first: int, last: int, max_points: int, attributes: tuple[str, ...]) -> Iterator[PointBatch]:
+        with self.info.path.open("rb") as file:
+            if self._header.are_points_compressed:
+                records = LazChunks(self.info.path, file, self._header, self._dtype, attributes=attributes)
+            else:
+                records = self._records(self.info.path, file, attributes, parallel=True)
+            records.seek(first)
+            yield from self._batches(records, last - first, max_points, attributes)
+
+    def _batches(
+        self, records: Records | LazRecords | LazChunks, n_points: int, max_points: int, attributes: tuple[str, ...]
+    ) -> Iterator[PointBatch]:
+        # lazrs works on the chunks of one call in parallel, so it is given a whole batch at a time
+        step = BLOCK_POINTS if isinstance(records, Records) else max_points
+        buffer = np.empty(min(step, max_points, n_points), self._dtype)
+        for first in range(0, n_points, max_points):
+            n = min(max_points, n_points - first)
+            batch = PointBatch(np.empty((n, 3)), {a: np.empty(n, ATTRIBUTES[a]) for a in attributes})
+            for i in range(0, n, len(buffer)):
+                block = buffer[: n - i]
+                records.read_into(block)
+                for j in range(0, len(block), BLOCK_POINTS):
+                    self._unpack(block[j : j + BLOCK_POINTS], batch, i + j)
+            yield batch
 
     def _unpack(self, records: np.ndarray, batch: PointBatch, first: int) -> None:
         """Write the columns of (n,) records into rows ``first`` … of ``batch``."""

@@ -22,6 +22,8 @@ _LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}  # item type → layers: point14, rgb14, 
 _BYTES14 = 14  # one layer a byte
 _ENDLESS_CHUNK = 0xFFFF_FFFE
 _MAX_CHUNK_POINTS = 1 << 24  # the parallel decompressor holds whole chunks; writers use 50 000
+PART_CHUNK_POINTS = 50_000
+"""Points of a chunk as nearly all writers make them: what starts inside one has it decompressed for a part of it."""
 
 
 class LazRecords:
@@ -55,10 +57,7 @@ class LazRecords:
         file.seek(header.offset_to_point_data)
         lazrs = _lazrs()
         decompressor = lazrs.ParLasZipDecompressor if parallel else lazrs.LasZipDecompressor
-        layers = lazrs.SELECTIVE_DECOMPRESS_XY_RETURNS_CHANNEL | lazrs.SELECTIVE_DECOMPRESS_Z
-        for attribute in attributes:
-            layers |= getattr(lazrs, f"SELECTIVE_DECOMPRESS_{attribute.upper()}", 0)
-        self._decompressor = decompressor(file, record, lazrs.DecompressionSelection(layers))
+        self._decompressor = decompressor(file, record, _selection(attributes))
 
     def seek(self, point: int) -> None:
         """The next record to be read; where ``can_seek``."""
@@ -67,6 +66,74 @@ class LazRecords:
     def read_into(self, out: np.ndarray) -> None:
         """Fill (n,) records. Raises lazrs.LazrsError where the compressed data ends early or makes no sense."""
         self._decompressor.decompress_many(out.view(np.uint8))
+
+
+class LazChunks:
+    """The point records of a compressed file that has chunks, from any point on.
+
+    lazrs 0.8 cannot seek among chunks of several sizes, those of COPC; here whole chunks are read by the chunk table,
+    those that a call needs side by side.
+    file, header, dtype, attributes : as for ``LazRecords``.  Memory: the chunks of one call, at most 2²⁴ points each.
+    """
+
+    def __init__(self, path: Path, file: BinaryIO, header: Any, dtype: np.dtype, *, attributes: Collection[str]):
+        self._path, self._file, self._selection = path, file, _selection(attributes)
+        self._record = _compression_record(path, header, dtype)
+        largest = _check_chunks(path, file, header, self._record)
+        if largest > _MAX_CHUNK_POINTS:
+            raise InputError(f"{path}: found a chunk of {largest} points, expected at most {_MAX_CHUNK_POINTS}")
+        file.seek(header.offset_to_point_data)
+        self._chunks = _lazrs().read_chunk_table(file, _lazrs().LazVlr(self._record))
+        n_points, n_bytes = np.array(self._chunks, np.int64).reshape(-1, 2).T
+        self._first_point = np.concatenate([[0], np.cumsum(n_points)])
+        self._first_byte = header.offset_to_point_data + 8 + np.concatenate([[0], np.cumsum(n_bytes)])
+        self._held, self._first_held = np.empty(0, dtype), 0
+        self._next, self._end = 0, header.point_count
+
+    def seek(self, point: int) -> None:
+        """The next record to be read."""
+        self._next = point
+
+    def read_into(self, out: np.ndarray) -> None:
+        """Fill (n,) records. Raises lazrs.LazrsError where the compressed data makes no sense."""
+        while len(out):
+            at = self._next - self._first_held
+            if not 0 <= at < len(self._held):
+                self._decompress(self._next, min(self._next + len(out), self._end))
+                at = self._next - self._first_held
+            n = min(len(out), len(self._held) - at)
+            out[:n] = self._held[at : at + n]
+            out, self._next = out[n:], self._next + n
+
+    def _decompress(self, first: int, last: int) -> None:
+        """Hold the chunks of the points ``first`` … ``last`` − 1."""
+        begin = int(np.searchsorted(self._first_point, first, side="right")) - 1
+        end = int(np.searchsorted(self._first_point, last, side="left"))
+        self._file.seek(int(self._first_byte[begin]))
+        packed = self._file.read(int(self._first_byte[end] - self._first_byte[begin]))
+        self._first_held = int(self._first_point[begin])
+        self._held = np.empty(min(int(self._first_point[end]), self._end) - self._first_held, self._held.dtype)
+        sizes = list(self._chunks[begin:end])
+        n, n_bytes = sizes[-1]  # the last one of a file may hold fewer points than the table says
+        sizes[-1] = (min(n, self._end - int(self._first_point[end - 1])), n_bytes)
+        _lazrs().decompress_points_with_chunk_table(
+            packed, self._record, self._held.view(np.uint8), sizes, self._selection
+        )
+
+
+def has_chunks(header: Any) -> bool:
+    """Whether ``LazChunks`` can read a compressed file."""
+    records = header.vlrs.get("LasZipVlr")
+    return bool(records) and _compressor(bytes(records[0].record_data)) != _POINTWISE
+
+
+def _selection(attributes: Collection[str]) -> Any:
+    """What lazrs is to decompress: positions, and the layers of these attributes."""
+    lazrs = _lazrs()
+    layers = lazrs.SELECTIVE_DECOMPRESS_XY_RETURNS_CHANNEL | lazrs.SELECTIVE_DECOMPRESS_Z
+    for attribute in attributes:
+        layers |= getattr(lazrs, f"SELECTIVE_DECOMPRESS_{attribute.upper()}", 0)
+    return lazrs.DecompressionSelection(layers)
 
 
 def _lazrs() -> Any:

@@ -9,6 +9,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from ..errors import InputError
+from ..points import PointBatch
 from .columns import SAMPLE_POINTS, Table, TableSource
 from .source import check_promise
 
@@ -56,6 +57,8 @@ def sample_records(records: Any, n_points: int, dtype: np.dtype) -> np.ndarray:
 class RecordSource(TableSource):
     """A file whose points are records of one structured dtype."""
 
+    part_points = 1
+
     def __init__(self, path: Path, *, offset: int, dtype: np.dtype, n_points: int, format: str, **info: Any):
         """Raises InputError if the file is too short for ``n_points`` records from byte ``offset``."""
         check_promise(path, n_points, dtype.itemsize, path.stat().st_size - offset)
@@ -67,9 +70,16 @@ class RecordSource(TableSource):
             return sample_records(Records(self._path, file, self._offset, self._dtype), self._n_points, self._dtype)
 
     def _tables(self, max_points: int, columns: Collection[str]) -> Iterator[Table]:
+        return self._blocks(0, self._n_points, max_points)
+
+    def _read_part(self, first: int, last: int, max_points: int, attributes: tuple[str, ...]) -> Iterator[PointBatch]:
+        return self._batches_of(self._blocks(first, last, max_points), attributes)
+
+    def _blocks(self, first: int, last: int, max_points: int) -> Iterator[np.ndarray]:
         with self._path.open("rb") as file:
             records = Records(self._path, file, self._offset, self._dtype)
-            for first in range(0, self._n_points, max_points):
-                block = np.empty(min(max_points, self._n_points - first), self._dtype)
+            records.seek(first)
+            for begin in range(first, last, max_points):
+                block = np.empty(min(max_points, last - begin), self._dtype)
                 records.read_into(block)
                 yield block

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +38,12 @@ class Source(ABC):
     """A file of points whose header has been read and believed."""
 
     info: SourceInfo
+    part_points: int | None = None
+    """Parts are read best from multiples of this; None where only the whole file can be read."""
+
+    def part(self, first: int, last: int) -> Source:
+        """The points ``first`` … ``last`` − 1, as a source of its own, where ``part_points`` is not None."""
+        return _Part(self, first, last)
 
     def batches(self, max_points: int, attributes: Collection[str] | None = None) -> Iterator[PointBatch]:
         """The points in file order, at most ``max_points`` (≥ 1) at a time; can be called again.
@@ -65,6 +71,19 @@ class Source(ABC):
     @abstractmethod
     def _read(self, max_points: int, attributes: tuple[str, ...]) -> Iterator[PointBatch]:
         """The batches, none of them empty, carrying exactly ``attributes``."""
+
+    def _read_part(self, first: int, last: int, max_points: int, attributes: tuple[str, ...]) -> Iterator[PointBatch]:
+        """The same of a part, where ``part_points`` is not None."""
+        raise NotImplementedError
+
+
+class _Part(Source):
+    def __init__(self, whole: Source, first: int, last: int) -> None:
+        self._whole, self._first, self._last = whole, first, last
+        self.info = replace(whole.info, n_points=last - first)
+
+    def _read(self, max_points: int, attributes: tuple[str, ...]) -> Iterator[PointBatch]:
+        return self._whole._read_part(self._first, self._last, max_points, attributes)
 
 
 def no_points(path: Path) -> InputError:

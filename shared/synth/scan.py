@@ -43,6 +43,7 @@ class CityScan(Source):
     Cost: time linear in n_points; memory of one batch, a few chunks and about 4 MB a block of the city.
     """
 
+    part_points = CHUNK_POINTS
     ATTRIBUTES = ("rgb", "normal", "intensity", "classification", "return_number")
 
     def __init__(
@@ -84,9 +85,12 @@ class CityScan(Source):
         )
 
     def _read(self, max_points: int, attributes: tuple[str, ...]) -> Iterator[PointBatch]:
+        return self._read_part(0, self.n_points, max_points, attributes)
+
+    def _read_part(self, first: int, last: int, max_points: int, attributes: tuple[str, ...]) -> Iterator[PointBatch]:
         pending: list[PointBatch] = []
         missing = max_points
-        for chunk in self._chunks(attributes):
+        for chunk in self._chunks(first, last, attributes):
             while len(chunk) >= missing:
                 yield concatenate([*pending, chunk.select(slice(0, missing))])
                 chunk = chunk.select(slice(missing, None))
@@ -97,13 +101,17 @@ class CityScan(Source):
         if pending:
             yield concatenate(pending)
 
-    def _chunks(self, attributes: tuple[str, ...]) -> Iterator[PointBatch]:
-        """The chunks in order, a few of them made ahead by threads."""
+    def _chunks(self, first: int, last: int, attributes: tuple[str, ...]) -> Iterator[PointBatch]:
+        """The chunks in order, cut to the points ``first`` … ``last`` − 1, a few of them made ahead by threads."""
         n_threads = len(os.sched_getaffinity(0))
         ahead: deque[Future[PointBatch]] = deque()
+
+        def part(start: int) -> PointBatch:
+            return self._chunk(start, attributes).select(slice(max(first - start, 0), last - start))
+
         with ThreadPoolExecutor(n_threads, "synth") as pool:
-            for start in range(0, self.n_points, CHUNK_POINTS):
-                ahead.append(pool.submit(self._chunk, start, attributes))
+            for start in range(first // CHUNK_POINTS * CHUNK_POINTS, last, CHUNK_POINTS):
+                ahead.append(pool.submit(part, start))
                 if len(ahead) > 2 * n_threads:
                     yield ahead.popleft().result()
             while ahead:

@@ -7,10 +7,11 @@ from splatpipe.shared.camera import look_at, perspective_camera
 from splatpipe.shared.errors import MessageError, SplatpipeError
 from splatpipe.shared.messages import (
     RENDER_POINT,
+    FrameStart,
     Kind,
     RenderPoints,
     VisibilityBits,
-    decode_camera,
+    decode_frame_start,
     decode_render_points,
     decode_visibility,
 )
@@ -27,11 +28,13 @@ entries["offset"] = rng.integers(0, 2**40, 500)
 entries["range"], entries["stride"] = 3, 1
 
 for _ in range(5):
-    transport.send(after, camera)
+    transport.send(after, FrameStart(camera, 3))
     transport.send(after, bits)
     transport.send(after, RenderPoints(7, entries))
     transport.send(after, RenderPoints(8, entries[:0]))
-    got = decode_camera(*transport.receive(before, Kind.CAMERA, 1000))
+    start = decode_frame_start(*transport.receive(before, Kind.FRAME_START, 1000))
+    got = start.camera
+    assert (start.frame, start.plan) == (7, 3)
     assert np.array_equal(got.clip_from_world, camera.clip_from_world), "camera"
     assert (got.frame, got.width, got.height, got.near) == (7, 640, 480, 0.1)
     theirs = np.random.default_rng(before)
@@ -54,7 +57,7 @@ for _ in range(8):  # take what was refused off the wire, so that the ranks can 
 transport.finish()
 assert transport.agree(transport.rank) == list(range(transport.size))
 transport.timeout_s = 0.2
-with pytest.raises(SplatpipeError, match=f"waited 0.2 s for rank {before}: CAMERA"):
-    transport.receive(before, Kind.CAMERA, 1000)
+with pytest.raises(SplatpipeError, match=f"waited 0.2 s for rank {before}: FRAME_START"):
+    transport.receive(before, Kind.FRAME_START, 1000)
 print(f"rank {transport.rank} done", flush=True)
 transport.meet()
