@@ -13,6 +13,7 @@ from typing import Annotated, Any
 
 import typer
 
+from ..shared.byte_size import parse_bytes
 from ..shared.compile_cache import ensure_compile_cache
 from ..shared.errors import InputError, SplatpipeError
 from ..shared.files import DISK_FULL
@@ -51,6 +52,9 @@ def run(
     sets: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a key: output.frames=10.")
     ] = None,
+    complete: Annotated[
+        bool, typer.Option("--complete", help="Paged points: wait for all of a frame; sets memory.complete.")
+    ] = False,
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on with a run that was cut short: draw only what is missing.")
     ] = False,
@@ -64,7 +68,8 @@ def run(
     """
     from .run import run_command
 
-    raise typer.Exit(run_command(config, [*(sets or []), *["output.resume=true"] * resume], json))
+    overridden = [*["memory.complete=true"] * complete, *["output.resume=true"] * resume]
+    raise typer.Exit(run_command(config, [*(sets or []), *overridden], json))
 
 
 @app.command()
@@ -117,7 +122,7 @@ def build(
         flatness=flatness,
         memory_bytes=parse_bytes(memory, "--memory") if memory else None,
         up=up,
-        attributes=tuple(name.strip() for name in attributes.split(",")) if attributes else None,
+        attributes=split_names(attributes),
         normals=normals,
         splats=splats,
         features=features,
@@ -142,18 +147,32 @@ def synth(
     splats: Annotated[bool, typer.Option("--splats", help="As for `splatpipe build`.")] = False,
     features: Annotated[bool, typer.Option("--features", help="As for `splatpipe build`.")] = False,
     pools: Annotated[bool, typer.Option("--pools", help="As for `splatpipe build`.")] = False,
+    extent: Annotated[float, typer.Option(help="Side of the city, metres, up to 873.")] = 225.0,
+    memory: Annotated[str, typer.Option(help="As for `splatpipe build`.")] = "",
+    attributes: Annotated[str, typer.Option(help="As for `splatpipe build`.")] = "",
     overwrite: Annotated[bool, typer.Option(help="Replace an existing scene.")] = False,
     ranks: RanksOption = 0,
+    json: JsonOption = None,
 ) -> None:
     """Make a synthetic city scan: a scene directory, or a LAS/LAZ file.
+
+    A scene larger than memory: `splatpipe synth large.scene --points 1000000000 --extent 873 --attributes rgb`
 
     Example: `splatpipe synth city.scene --points 2000000`
     """
     from ..shared.build import BuildSettings
     from .scenes import synth_command
 
-    settings = BuildSettings(overwrite=overwrite, up="z", splats=splats, features=features, pools=pools)
-    raise typer.Exit(synth_command(output, points, seed, settings, ranks))
+    settings = BuildSettings(
+        overwrite=overwrite,
+        up="z",
+        splats=splats,
+        features=features,
+        pools=pools,
+        memory_bytes=parse_bytes(memory, "--memory") if memory else None,
+        attributes=split_names(attributes),
+    )
+    raise typer.Exit(synth_command(output, points, seed, extent, settings, json, ranks))
 
 
 @app.command()
@@ -523,6 +542,30 @@ def bench_pipeline(
     _report(measure(config, sets or [], repeats), print_pipeline, json)
 
 
+@bench_app.command("paged")
+def bench_paged(
+    config: Annotated[Path, typer.Argument(help="Configuration of a run; its camera should move.")],
+    sets: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a key.")] = None,
+    budgets: Annotated[str, typer.Option(metavar="SIZE,SIZE,…", help="Values of memory.budget.")] = "250MB,500MB,1GB",
+    points: Annotated[str, typer.Option(metavar="M,M,…", help="Million points of sampling.point_budget.")] = "2,4,8",
+    error_frames: Annotated[int, typer.Option(help="Frames compared with complete ones.", min=1)] = 5,
+    json: JsonOption = None,
+) -> None:
+    """Points that stay on disk: error against run time for pools and budgets of points.
+
+    Example: `splatpipe bench paged configs/out-of-core.toml --budgets 500MB,1GB --json paged.json`
+    """
+    from .bench.paged import bench_paged as measure
+    from .bench.paged import print_paged
+
+    sizes = split_names(budgets) or ()
+    for size in sizes:
+        parse_bytes(size, "--budgets")
+    million = parse_numbers(points, "--points")
+    found = measure(config, sets or [], budgets=sizes, million_points=million, error_frames=error_frames)
+    _report(found, print_paged, json)
+
+
 @bench_app.command("balance")
 def bench_balance(
     topology: Annotated[str, typer.Option(help="One that has something to move.")] = "sort-first-only",
@@ -686,6 +729,11 @@ def _fail(error: BaseException, message: str, status: int) -> None:
     sys.exit(status)
 
 
+def split_names(text: str) -> tuple[str, ...] | None:
+    """The comma-separated names of an option; None for none."""
+    return tuple(name.strip() for name in text.split(",")) if text else None
+
+
 def parse_numbers(text: str, option: str, count: int | None = None) -> list[float]:
     """The comma-separated positive numbers of an option. Raises InputError naming it."""
     try:
@@ -695,29 +743,3 @@ def parse_numbers(text: str, option: str, count: int | None = None) -> list[floa
     if not values or not all(0 < value < 2**20 for value in values) or count not in (None, len(values)):
         raise InputError(f"{option} {text}: expected {count or 'some'} numbers above 0")
     return values
-
-
-def parse_bytes(text: str, option: str) -> int:
-    """Bytes of ``4GB``, ``500 MB``, ``2GiB`` or a plain number. Raises InputError naming the option."""
-    units = {
-        "": 1,
-        "B": 1,
-        "K": 1e3,
-        "KB": 1e3,
-        "M": 1e6,
-        "MB": 1e6,
-        "G": 1e9,
-        "GB": 1e9,
-        "T": 1e12,
-        "TB": 1e12,
-    }
-    units |= {"KIB": 2**10, "MIB": 2**20, "GIB": 2**30, "TIB": 2**40}
-    digits = text.strip().rstrip("BKMGTIbkmgti ")
-    unit = text.strip()[len(digits) :].strip().upper()
-    try:
-        value = float(digits) * units[unit]
-    except (ValueError, KeyError):
-        raise InputError(f"{option} {text}: expected a size such as 500MB or 4GiB") from None
-    if not 0 < value < 2**60:
-        raise InputError(f"{option} {text}: expected a size above 0")
-    return int(value)

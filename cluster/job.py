@@ -19,7 +19,7 @@ from ..nodes.raster.choose import check_style, make_rasterizer, resolve_rasteriz
 from ..nodes.raster.cpu import kernels_cached
 from ..nodes.raster.gl_context import require_gl
 from ..nodes.render import RenderNode, Wanted, load_drawn, load_points
-from ..nodes.sampling import Pools, SamplingNode
+from ..nodes.sampling import Pools, SamplingNode, check_point_budget
 from ..shared.camera import Camera
 from ..shared.colour import Colouring, colormap_words, parse_colour
 from ..shared.config import RunConfig
@@ -29,6 +29,7 @@ from ..shared.octree import Octree
 from ..shared.store import Scene
 from ..shared.views import camera_views
 from ..shared.wall import Screen, wall_of
+from .paging import check_paging
 from .sink import Film, FrameSink, H264Film, layer_name
 from .topologies import check_topology
 
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from ..nodes.layer_render import LayerRenderNode
     from ..nodes.layer_sampling import LayerSamplingNode
     from ..nodes.raster.group_raster import ResidentGroups
+    from ..nodes.raster.paged_points import PagedPoints, Residency
     from ..shared.layers.layer import Layer
 
 SPLAT_COLOUR = "#d0d0d0"
@@ -59,6 +61,7 @@ class Job:
         check_topology(config)
         self.config = config
         self.threads = config.render.threads or len(os.sched_getaffinity(0))
+        self.paged = config.memory.residency == "paged"
         self.layers = self._read_layers() if config.layers else []
         self.scene = scene or self._open_scene()
         info = self.scene.info
@@ -79,6 +82,9 @@ class Job:
         self.point_filter = PointFilter.choose(self.scene, config.filter.classes, config.filter.boxes)
         self.why_no_pools = self._why_no_pools()
         self.pools: Pools = "off" if self.why_no_pools else config.sampling.pools
+        if self.paged:
+            check_paging(config, info)
+        check_point_budget(config.sampling.point_budget, self.pixel_threshold, self.coded, self.pools)
         self.wanted = Wanted(
             splats=self.splats is not None,
             features=self.splats is not None and self.splats.features,
@@ -162,7 +168,7 @@ class Job:
     @property
     def rasterizer(self) -> str:
         """Name of the rasterizer that draws, ``auto`` resolved."""
-        return "cpu" if self.coded else resolve_rasterizer(self.config.render.rasterizer)
+        return "cpu" if self.coded or self.paged else resolve_rasterizer(self.config.render.rasterizer)
 
     @property
     def position_bytes(self) -> float:
@@ -177,6 +183,11 @@ class Job:
     def attribute_bytes(self) -> int:
         """Bytes of a point's colour, and of a splat's normal and radius."""
         return (0 if self.colouring.mode == "constant" else 4) + (5 if self.splats else 0)
+
+    @property
+    def frames_ahead(self) -> int:
+        """How many frames the render rank is told of before it is their turn (``RenderStage.expect``)."""
+        return self.frames_in_flight - 1 if self.paged and self.config.memory.prefetch else 0
 
     def load_octree(self) -> Octree:
         """The cells, with what the sampling node of this run needs of them. Raises StoreError."""
@@ -209,6 +220,7 @@ class Job:
             whole_sets=self.coded,
             pools=self.pools,
             point_bytes=self.position_bytes + self.attribute_bytes,
+            point_budget=self.config.sampling.point_budget,
             own=own,
             margin_px=self._margin_px,
         )
@@ -227,7 +239,7 @@ class Job:
 
     def _open_scene(self) -> Scene:
         if self.config.scene.path:
-            return Scene.open(Path(os.path.normpath(self.config.scene.path)))
+            return Scene.open(Path(os.path.normpath(self.config.scene.path)), mapped=not self.paged)
         from ..shared.empty_scene import EmptyScene
 
         corners = [layer.bounds for layer in self.layers]
@@ -258,7 +270,16 @@ class Job:
         """The points of this run, or of a share of its scene, in the form it draws them from. Raises StoreError."""
         return load_drawn(scene or self.scene, self.colouring, self.wanted, verify=verify)
 
-    def make_rasterizer(self, points: ResidentPoints | ResidentGroups) -> Rasterizer:
+    def load_paged(self, scene: Scene | None = None) -> PagedPoints:
+        """The points of this run, or of a share of its scene, to be read by pages. Raises StoreError."""
+        from ..nodes.page_reader import load_paged
+        from ..nodes.raster.paged_points import Paging
+
+        memory = self.config.memory
+        paging = Paging(memory.budget_bytes, memory.complete)
+        return load_paged(scene or self.scene, self.colouring, self.point_filter, paging)
+
+    def make_rasterizer(self, points: ResidentPoints | ResidentGroups | PagedPoints) -> Rasterizer:
         """The rasterizer of this run over ``points``; the caller closes it. Raises DeviceError."""
         render = self.config.render
         return make_rasterizer(
@@ -287,13 +308,15 @@ class Job:
         layers drawn over it.  screen : of a wall, where no more is shown.
         """
         progress("loading points", 0)
-        points = self.load_drawn(scene, verify=self.config.scene.verify)
+        points = self.load_paged(scene) if self.paged else self.load_drawn(scene, verify=self.config.scene.verify)
         output = self.config.output
         with ExitStack() as stack:
             rasterizer = stack.enter_context(self.make_rasterizer(points))
             self.scene.release()
             node = RenderNode(rasterizer)
-            if rasterizer.name == "cpu" and not kernels_cached(pools=self.wanted.pools, groups=self.coded):
+            if rasterizer.name == "cpu" and not kernels_cached(
+                pools=self.wanted.pools, groups=self.coded, paged=self.paged
+            ):
                 progress("compiling kernels (once; kept for the next run)", 0)
             node.warm_up(self.camera(0))
             layers = None
@@ -310,7 +333,9 @@ class Job:
                 sink = stack.enter_context(
                     FrameSink(self.output, png=output.png, mp4=mp4, fps=output.fps, make_film=self.make_film)
                 )
-            yield RenderStage(node, layers, composer, sink, self.views.per_picture, self._seen(screen))
+            yield RenderStage(
+                node, layers, composer, sink, self.views.per_picture, self._seen(screen), self.frames_ahead
+            )
 
     def _seen(self, screen: Screen | None) -> Callable[[Picture], list[tuple[str, Picture]]]:
         """What is written of a picture: names of screens, and what they show; the name of a whole picture is empty."""
@@ -407,18 +432,29 @@ class RenderStage:
         sink: FrameSink | None,
         per_picture: int,
         seen: Callable[[Picture], list[tuple[str, Picture]]],
+        frames_ahead: int = 0,
     ) -> None:
         self._node = node
         self._layers = layers
         self._composer = composer
         self._sink = sink
         self._per_picture = per_picture
+        self.frames_ahead = frames_ahead
         self._seen = seen
         self.description = " + ".join(part.description for part in (node, layers) if part)
 
     def rasterize(self, camera: Camera, chosen: RenderPoints) -> np.ndarray:
         """(height, width) uint64 framebuffer words of a frame's points; valid until the next call."""
         return self._node.process(camera, chosen)
+
+    def expect(self, chosen: RenderPoints) -> None:
+        """Say what a frame that follows will draw; asked for up to ``frames_ahead`` frames, in order."""
+        self._node.expect(chosen)
+
+    @property
+    def residency(self) -> Residency | None:
+        """What the last frame found of paged points; None where points are resident."""
+        return self._node.residency
 
     def compose(self, camera: Camera, words: np.ndarray, of_layers: Sequence[RenderPoints] = ()) -> Picture | None:
         """The picture that a frame completes, its layers drawn over the words of its points; None before its last view

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -40,7 +40,7 @@ from .compositing.tiles import Tiles
 from .delivery import receive_scene, serve_scene
 from .job import Job, RenderStage
 from .layout import ALONE, Layout, Plan
-from .record import FrameCounts, StageClock, rank_record, spread_ms, summed_traffic
+from .record import FrameCounts, StageClock, rank_record, spread_ms, summed_traffic, with_missing
 from .selection import CullingPart, LaneCells, SamplingPart, first_plan, merged_entries, shares_of, with_borders
 from .transport import Transport
 from .wall import screen_windows, writes_screens
@@ -82,7 +82,9 @@ class Drawn:
             "rasterizer": self.rasterizer,
             "stages": {clock.stage: clock.summary() for clock in self.clocks},
             "latency_ms": spread_ms(self.latency_s),
-            "per_frame": {f"{clock.stage}_s": clock.work_s for clock in self.clocks} | self.counts.lists() | self.times,
+            "per_frame": with_missing(
+                {f"{clock.stage}_s": clock.work_s for clock in self.clocks} | self.counts.lists() | self.times
+            ),
             "loading_s": self.loading_s,
             "rendered_s": self.drawn - self.started,
             "finished_s": time.perf_counter() - self.started,
@@ -174,13 +176,11 @@ class FrameLoop:
             frames = None
             if self._rank == 0:
                 frames = Coordinator(job, self._layout, self._transport, self._plan, self.balancer)
+            coming = self._coming(frames, render)
             for i in range(len(job.frames) if self._lane is not None else 0):
-                with self._waits_in.waiting():
-                    start = frames.start(i, self._progress) if frames else self._receive_start()
-                self._follow(start.plan, frames)
-                self._select(start.camera)
-                if self._renders and render:
-                    self._draw(render, start.camera)
+                start, chosen, of_layers = next(coming)
+                if render and chosen:
+                    self._draw(render, start.camera, chosen, of_layers)
                 if self._shows and frames:
                     frames.finished()
                     self._progress("rendering", i + 1)
@@ -330,6 +330,51 @@ class FrameLoop:
 
     # --- a frame -----------------------------------------------------------------------------------------------------
 
+    def _coming(
+        self, frames: Coordinator | None, render: RenderStage | None
+    ) -> Iterator[tuple[FrameStart, RenderPoints | None, list[RenderPoints]]]:
+        """Frames in turn, selected as far as that is this rank's part: start, points and objects to draw.
+
+        Where points are paged, up to ``frames_ahead`` more are selected, or received if they are there, before it is
+        the turn of one, so that theirs are loaded meanwhile. None where plans change: they say how a frame is drawn.
+        """
+        n_ahead = render.frames_ahead if render and not self._balances else 0
+        n_frames, begun = len(self._job.frames), 0
+        ahead: deque[tuple[FrameStart, RenderPoints | None, list[RenderPoints]]] = deque()
+        for i in range(n_frames):
+            while begun < n_frames and (begun == i or (begun - i <= n_ahead and self._can_begin(frames))):
+                ahead.append(self._begin(begun, frames))
+                chosen = ahead[-1][1]
+                if n_ahead and render and chosen:
+                    render.expect(chosen)
+                begun += 1
+            yield ahead.popleft()
+
+    def _can_begin(self, frames: Coordinator | None) -> bool:
+        """Whether to begin another frame before it is its turn: this rank selects it, or somebody has."""
+        if self._culls or self._samples or self._lane is None or not self._transport:
+            return True
+        sampled = (
+            self._transport.has_note(rank, Kind.RENDER_POINTS) for rank in self._layout.lanes[self._lane].sampling
+        )
+        return bool(frames or self._transport.has_note(0, Kind.FRAME_START)) and all(sampled)
+
+    def _begin(self, i: int, frames: Coordinator | None) -> tuple[FrameStart, RenderPoints | None, list[RenderPoints]]:
+        """Do what comes before drawing of frame ``i``; without points for a rank that does not draw."""
+        with self._waits_in.waiting():
+            start = frames.start(i, self._progress) if frames else self._receive_start()
+        self._follow(start.plan, frames)
+        self._select(start.camera)
+        if not self._renders:
+            return start, None, []
+        lane, info = self._layout.lanes[self._lane or 0], self._job.scene.info
+        most = info.n_cells + info.n_stored // 2**31 + 1  # a longer range is split
+        with self._clocks["render"].waiting():
+            received = [self._take_entries(rank, most) for rank in lane.sampling]
+            layers = self._job.layers if self._shows else []
+            of_layers = [self._take_entries(self._layout.lanes[0].sampling[0], len(layer.octree)) for layer in layers]
+        return start, merged_entries(start.camera.frame, received), of_layers
+
     def _receive_start(self) -> FrameStart:
         assert self._transport
         return decode_frame_start(*self._transport.receive(0, Kind.FRAME_START, FRAME_START_BYTES))
@@ -379,18 +424,11 @@ class FrameLoop:
                 self._hand(self._layout.display, Kind.RENDER_POINTS, message)
             self._counts.add(chosen)
 
-    def _draw(self, render: RenderStage, camera: Camera) -> None:
+    def _draw(self, render: RenderStage, camera: Camera, chosen: RenderPoints, of_layers: list[RenderPoints]) -> None:
         """Rasterize this rank's part, and on the display rank make the picture of all parts."""
-        layout, clock = self._layout, self._clocks["render"]
-        lane = layout.lanes[self._lane or 0]
-        info = self._job.scene.info
-        most = info.n_cells + info.n_stored // 2**31 + 1  # a longer range is split
-        with clock.waiting():
-            received = [self._take_entries(rank, most) for rank in lane.sampling]
-            layers = self._job.layers if self._shows else []
-            of_layers = [self._take_entries(layout.lanes[0].sampling[0], len(layer.octree)) for layer in layers]
+        clock = self._clocks["render"]
         with clock.working():
-            words = render.rasterize(camera, merged_entries(camera.frame, received))
+            words = render.rasterize(camera, chosen)
             picture = None if self._meet else render.compose(camera, words, of_layers)
         if self._meet:
             with self._clocks["compositing"].working():
@@ -403,6 +441,7 @@ class FrameLoop:
             if self._waits_for_screens:
                 self._meet_screens(self._waits_for_screens, camera.frame)
         self._counts.add_layers(of_layers)
+        self._counts.add_residency(render.residency)
 
     def _meet_screens(self, transport: Transport, frame: int) -> None:
         """On the display rank: wait for every other screen's part of a frame, so that it is done when all are."""
@@ -449,7 +488,7 @@ class Coordinator:
         self.plans: dict[int, Plan] = {}
         self._others = [rank for rank in layout.workers if rank]
         self._display = layout.display
-        self._ahead = job.frames_in_flight if self._others else 1
+        self._ahead = job.frames_in_flight if self._others else 1 + job.frames_ahead
         self._starts: list[FrameStart] = []
         self._issued_s: list[float] = []
         self.latency_s: list[float] = []
@@ -533,7 +572,7 @@ def _merged(drawn: Drawn, told: Sequence[dict[str, Any]]) -> dict[str, Any]:
     names = dict.fromkeys(name for of in told for name in of["times"])
     times = {name: [s for of in told for s in of["times"].get(name, [])] for name in names}
     rasterizer = next(of["rasterizer"] for of in told if of["rasterizer"])
-    per_frame = {f"{clock.stage}_s": clock.work_s for clock in clocks} | counts | times
+    per_frame = with_missing({f"{clock.stage}_s": clock.work_s for clock in clocks} | counts | times)
     return drawn.record() | {
         "rasterizer": rasterizer,
         "stages": {clock.stage: clock.summary() for clock in clocks},

@@ -9,13 +9,17 @@ import subprocess
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..shared.messages import RenderPoints, VisibilityBits
+
+if TYPE_CHECKING:
+    from ..nodes.raster.paged_points import Residency
 
 RECORD_VERSION = 1
 
@@ -76,9 +80,22 @@ class FrameCounts:
         if of_layers:
             self._lists.setdefault("objects", []).append([chosen.n_points for chosen in of_layers])
 
+    def add_residency(self, found: Residency | None) -> None:
+        """Count what a frame found of paged points; nothing where points are resident."""
+        for name, value in (asdict(found) if found else {}).items():
+            self._lists.setdefault(name, []).append(value)
+
     def lists(self) -> dict[str, list[Any]]:
         """Name → one count a frame; ``objects``: one list a frame, a count for each layer."""
         return self._lists
+
+
+def with_missing(per_frame: dict[str, list[Any]]) -> dict[str, list[Any]]:
+    """The lists of a run with ``missing``: of each frame, the share of paged points that were not there."""
+    if "missing_points" not in per_frame:
+        return per_frame
+    counts = zip(per_frame["missing_points"], per_frame["wanted_points"], strict=True)
+    return per_frame | {"missing": [missing / max(wanted, 1) for missing, wanted in counts]}
 
 
 def spread_ms(seconds: list[float]) -> dict[str, float]:

@@ -277,6 +277,10 @@ def _tell(summary: dict[str, Any]) -> None:
         f"{summary['frames']} frames{kept}, {summary['frames_per_s']:.1f} frames/s, {summary['topology']}, "
         f"{summary['rasterizer']}; median {stages}"
     )
+    if missing := summary["per_frame"].get("missing"):
+        shares = f"{mean(missing):.1%} of a frame's points missing, at most {max(missing):.1%}"
+        read = sum(summary["per_frame"]["loaded_bytes"])
+        console.print(f"  paged: {shares}, none in {missing.count(0.0)} frames; {read / 1e6:,.0f} MB read")
     if summary["layers"]:
         from ..shared.layers.kinds import objects_of
     for i, layer in enumerate(summary["layers"]):

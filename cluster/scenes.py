@@ -35,17 +35,25 @@ def build_command(inputs: list[str], output: Path, settings: BuildSettings, json
     return _build(lambda: [str(path) for path in expand_inputs(inputs)], open_source, output, settings, json, n_ranks)
 
 
-def synth_command(output: Path, n_points: int, seed: int, settings: BuildSettings, n_ranks: int) -> int:
+def synth_command(
+    output: Path,
+    n_points: int,
+    seed: int,
+    extent_m: float,
+    settings: BuildSettings,
+    json: Path | None = None,
+    n_ranks: int = 0,
+) -> int:
     """``splatpipe synth``: a scene, or a file where the name ends in .las or .laz; the exit status."""
     from ..shared.synth import CityScan, write_las
 
     if output.suffix.lower() not in (".las", ".laz"):
-        return _build(lambda: ["city"], lambda _: CityScan(n_points, seed), output, settings, None, n_ranks)
+        return _build(lambda: ["city"], lambda _: CityScan(n_points, seed, extent_m), output, settings, json, n_ranks)
     if n_ranks > 1 or inside_mpi():
         raise InputError(f"{output}: a point file is written by one process, expected a scene, or no ranks")
     if output.exists() and not settings.overwrite:
         raise InputError(f"{output}: exists already; --overwrite replaces it")
-    write_las(CityScan(n_points, seed), output)
+    write_las(CityScan(n_points, seed, extent_m), output)
     _console.print(f"wrote {output}: {n_points:,} points")
     return 0
 

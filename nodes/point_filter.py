@@ -10,7 +10,7 @@ the bits of x, which no arithmetic touches.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal, Protocol
@@ -104,17 +104,31 @@ class PointFilter:
         offset, so they are exact however far the scene is from the world's origin.
         Cost: one compiled pass over the columns, mapped from the files; memory 4 bytes a point.
         """
+        return self.reader(scene)(0, x, y, z)
+
+    def reader(self, scene: Scene) -> Callable[[int, np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
+        """``filtered_x`` of any range of stored points: called with its first point and the (k,) columns of the range.
+
+        Cost: of the scene's blocks, once.
+        """
         first, origin = scene.blocks()
-        codes = scene.attribute("classification") if self.classes else np.empty(0, np.uint8)
+        codes = scene.column("attr_classification") if self.classes else None
         keep_class = np.zeros(256, bool)
         keep_class[list(self.classes)] = True
         corners = np.array([(box.lower, box.upper) for box in self.boxes], np.float64).reshape(-1, 2, 3)
         keep_inside = np.array([box.keep_inside for box in self.boxes], bool)
-        out = np.empty(len(x), np.float32)
-        ends = np.append(first[1:], len(x))
-        x, y, z, codes = map(read_only, (x, y, z, codes))
-        _filter(x, y, z, codes, keep_class, first, ends, origin, corners, keep_inside, out)
-        return out
+
+        def filtered(start: int, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+            stop = start + len(x)
+            begin, end = int(np.searchsorted(first, start, side="right")) - 1, int(np.searchsorted(first, stop))
+            borders = np.append(np.maximum(first[begin:end], start), stop) - start
+            part = np.empty(0, np.uint8) if codes is None else codes[start:stop]
+            out = np.empty(len(x), np.float32)
+            x, y, z, part = map(read_only, (x, y, z, part))
+            _filter(x, y, z, part, keep_class, borders[:-1], borders[1:], origin[begin:end], corners, keep_inside, out)
+            return out
+
+        return filtered
 
 
 def features_left(features: CellFeatures, x: np.ndarray) -> CellFeatures:

@@ -22,6 +22,7 @@ from .raster import Rasterizer, ResidentPoints
 
 if TYPE_CHECKING:
     from .raster.group_raster import ResidentGroups
+    from .raster.paged_points import Residency
 
 
 class RenderNode:
@@ -47,6 +48,17 @@ class RenderNode:
         if camera.frame != chosen.frame:
             raise MessageError(f"render-points: found frame {chosen.frame}, expected frame {camera.frame}")
         return self._rasterizer.draw(camera, chosen.entries)
+
+    def expect(self, chosen: RenderPoints) -> None:
+        """Say what a frame that follows will draw; for paged points, which are then loaded meanwhile."""
+        expect = getattr(self._rasterizer, "expect", None)
+        if expect is not None:
+            expect(chosen.frame, chosen.entries)
+
+    @property
+    def residency(self) -> Residency | None:
+        """What the last frame found of paged points; None where points are resident."""
+        return getattr(self._rasterizer, "residency", None)
 
 
 @dataclass(frozen=True)

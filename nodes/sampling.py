@@ -13,6 +13,11 @@ A cut cell that has a pooled form (``shared.codecs.streams``) may be drawn from 
 its grid is so fine that a bin is at most 1/√2 pixel wide, that is where the cell is at most 2**bits / √2 pixels across
 (Kim, Lee, Varshney, "Vertex Transformation Streams", section 6), and where that reads fewer bytes or takes less time.
 The form has every bin that holds a point of the set, so it is never sparser than a part of the set seen on that grid.
+
+A frame may have a budget of points. One that would need more is cut with a share of the points a pixel, and a threshold
+that is larger by as much: a share of the ladder 2**(−k / ``SHARES_AN_OCTAVE``) that keeps to the budget while the next
+larger one does not, found by galloping and bisection. It follows from the camera alone, so any rank, at any time, finds
+the same.
 """
 
 from __future__ import annotations
@@ -40,6 +45,10 @@ SHARP_DENSITY = 2.0
 """Points of cells with an edge or a corner, in points of other cells of the same area (thesis 4.4.3)."""
 POOLED_POINT_COST = 1.15
 """Time of drawing a pooled point on the CPU, in points of a range: 0.97 … 1.27 measured, larger cells less."""
+SHARES_AN_OCTAVE = 8
+"""Steps of the share of points in which a frame with a budget is thinned out: 9 % each."""
+_MOST_STEPS = 1000 * SHARES_AN_OCTAVE
+"""By then the root alone is drawn, with one point, however near the camera is."""
 _EXPANDED = -1
 _POOLED = -2
 
@@ -56,6 +65,8 @@ class SamplingNode:
     pools : whether cells are drawn from their pooled form: never; where that reads fewer ``bytes``, or where it takes
         less ``time`` (``POOLED_POINT_COST``). The octree needs their sizes.
     point_bytes : what drawing a point of a range reads.
+    point_budget : most points of a frame; 0: no limit. Ranges only, and of thresholds above 0.
+    step : of the ladder of shares, of the last frame; 0: it was not thinned out.
     own : (n,) bool, cells that this node answers for, where others draw the rest; None: all.
     margin_px : as of the culling node, for windows.
     Raises ConfigError for a threshold that is not a finite number ≥ 0, points per pixel that are not one > 0, or an
@@ -71,6 +82,7 @@ class SamplingNode:
         whole_sets: bool = False,
         pools: Pools = "off",
         point_bytes: float = POINT_BYTES,
+        point_budget: int = 0,
         own: np.ndarray | None = None,
         margin_px: float = 1.0,
     ):
@@ -80,6 +92,9 @@ class SamplingNode:
             raise ConfigError(f"sampling.points_per_pixel = {points_per_pixel}, expected a number > 0")
         if pools != "off" and octree.pool_points is None:
             raise ConfigError(f"sampling.pools = {pools!r}: the octree was loaded without pooled forms")
+        check_point_budget(point_budget, pixel_threshold, whole_sets, pools)
+        self.point_budget = point_budget
+        self.step = 0
         self.pixel_threshold = float(pixel_threshold)
         self.points_per_pixel = float(points_per_pixel)
         self.whole_sets = whole_sets
@@ -114,11 +129,14 @@ class SamplingNode:
         depth-first order; and a leaf above the threshold all its points. With ``whole_sets`` the same cells yield all
         the points of their range, in entries of stride 1.
 
+        With a ``point_budget`` there are at most so many points, and N is counted and the threshold raised as it takes.
+
         A cell is drawn in one form: pooled where it is small enough and that is less than those points would be.
 
         Raises MessageError if the bits belong to another frame or another octree.
         Cost: O(cells in the level-of-detail window) plus a scan of one word per cell. With a threshold of 0 no
-        projected size is computed. Pools add a look at each cell that has a form, and nothing where they are off.
+        projected size is computed. A frame above its budget is cut some six times over. Pools add a look at each cell
+        that has a form, and nothing where they are off.
         """
         tree = self._octree
         if bits.frame != camera.frame or bits.n_cells != len(tree):
@@ -126,7 +144,7 @@ class SamplingNode:
                 f"visibility bits: found frame {bits.frame} of {bits.n_cells} cells,"
                 f" expected frame {camera.frame} of {len(tree)}"
             )
-        n_cut = self._cut(camera, bits) if self.pixel_threshold else self._all_leaves(bits)
+        n_cut = self._cut_to_budget(camera, bits) if self.pixel_threshold else self._all_leaves(bits)
         if self.whole_sets:
             np.copyto(self._n_drawn, tree.n_points, where=self._n_drawn > 0)
         if self._others is not None:
@@ -164,8 +182,35 @@ class SamplingNode:
             : _merge(tree.first_point, tree.n_points, self._n_drawn, self._stored_order, strided, MAX_RANGE, entries)
         ]
 
-    def _cut(self, camera: Camera, bits: VisibilityBits) -> int:
+    def _cut_to_budget(self, camera: Camera, bits: VisibilityBits) -> int:
         """Fill ``_n_drawn``; the size of the cut."""
+        self.step = 0
+        n_cut, n_points = self._cut(camera, bits, 0)
+        if not self.point_budget or n_points <= self.point_budget:
+            return n_cut
+
+        def fits(step: int) -> bool:
+            return self._cut(camera, bits, step)[1] <= self.point_budget
+
+        # from where it would be if points were in proportion to the share
+        guess = min(math.ceil(SHARES_AN_OCTAVE * math.log2(n_points / self.point_budget)), _MOST_STEPS)
+        too_many, enough, stride = 0, guess, 1
+        if fits(guess):
+            while enough - stride > 0 and fits(enough - stride):
+                enough, stride = enough - stride, 2 * stride
+            too_many = max(enough - stride, 0)
+        else:
+            while not fits(min(enough + stride, _MOST_STEPS)) and enough + stride < _MOST_STEPS:
+                enough, stride = enough + stride, 2 * stride
+            too_many, enough = enough, min(enough + stride, _MOST_STEPS)
+        while enough - too_many > 1:
+            middle = (too_many + enough) // 2
+            too_many, enough = (too_many, middle) if fits(middle) else (middle, enough)
+        self.step = enough
+        return self._cut(camera, bits, enough)[0]
+
+    def _cut(self, camera: Camera, bits: VisibilityBits, step: int) -> tuple[int, int]:
+        """Fill ``_n_drawn``, thinned by so many steps of the ladder; the size of the cut, and the points it draws."""
         tree = self._octree
         visible = bits.bits.view()
         visible.flags.writeable = False  # received or fresh, one type to the compiler
@@ -184,6 +229,8 @@ class SamplingNode:
             camera.focal_px,
             self.pixel_threshold,
             self.points_per_pixel,
+            2.0 ** (-step / SHARES_AN_OCTAVE),
+            tree.point_order == "depth-first",
             self._area,
             self._n_drawn,
         )
@@ -214,6 +261,13 @@ class SamplingNode:
         """The same without level of detail: every visible leaf, whatever its size on the screen."""
         np.multiply(self._leaf_points, bits.unpack(), out=self._n_drawn)
         return int(np.count_nonzero(self._n_drawn))
+
+
+def check_point_budget(point_budget: int, pixel_threshold: float, whole_sets: bool, pools: Pools) -> None:
+    """Raise ConfigError if frames cannot be thinned out to a budget, as of ``SamplingNode``."""
+    if point_budget and (whole_sets or pools != "off" or not pixel_threshold):
+        found = "sets drawn whole" if whole_sets else f"sampling.pools = {pools!r}" if pools != "off" else "threshold 0"
+        raise ConfigError(f"sampling.point_budget = {point_budget}: found {found}, which takes all points of a cell")
 
 
 @njit(nogil=True, cache=True)
@@ -250,19 +304,25 @@ def _cut(
     focal_px,
     pixel_threshold,
     points_per_pixel,
+    share,
+    strided,
     area,
     n_drawn,
 ):
-    """Fill ``n_drawn``: points to draw of a cut cell, else 0 or ``_EXPANDED``. Returns the size of the cut."""
+    """Fill ``n_drawn``: points to draw of a cut cell, else 0 or ``_EXPANDED``.
+
+    share : of the points a pixel; the threshold is for the pixels that are left.
+    Returns the size of the cut, and the points that it draws.
+    """
     stratified = len(area) > 0
-    n_cut = 0
+    n_cut = n_taken = 0
     window_end = 1
     cell = 0
     while cell < window_end:
         n_drawn[cell] = 0
         visible = bits[cell >> 3] >> (cell & 7) & 1
         if visible and (cell == 0 or n_drawn[parent[cell]] == _EXPANDED):
-            n_pixels = _projected_pixels(centers, cell, edge[level[cell]], eye, near, focal_px)
+            n_pixels = share * _projected_pixels(centers, cell, edge[level[cell]], eye, near, focal_px)
             is_leaf = first_child[cell] < 0
             is_small = n_pixels <= pixel_threshold * pixel_threshold
             if stratified:
@@ -275,12 +335,14 @@ def _cut(
                 n_drawn[cell] = np.int64(min(needed, n_points[cell]))
             if n_drawn[cell] > 0:
                 n_cut += 1
+                stride = n_points[cell] // n_drawn[cell] if strided else 1
+                n_taken += (n_points[cell] + stride - 1) // stride if strided else n_drawn[cell]
             elif not is_leaf:
                 n_drawn[cell] = _EXPANDED
                 window_end = first_child[cell] + n_children[cell]
         cell += 1
     n_drawn[window_end:] = 0
-    return n_cut
+    return n_cut, n_taken
 
 
 @njit(nogil=True, cache=True)

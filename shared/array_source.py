@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import os
+import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,7 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from .errors import StoreError
-from .scene_info import SceneInfo
+from .scene_info import ArrayInfo, SceneInfo
 
 _CHUNK = 1 << 22
 
@@ -71,6 +73,53 @@ class ArrayFiles:
     def _data_offset(self, name: str) -> int:
         promised = self._info.arrays[name]
         return data_offset(self._file(name), np.dtype(promised.dtype), promised.shape)
+
+
+class ReadColumn:
+    """A column of an ``.npy`` file that is read where it is indexed; unlike a map, none of it counts as resident.
+
+    n : its entries, from entry ``first`` of the file on.
+    The file stays open until the column is dropped. Threads may read at once.
+    Raises StoreError naming the file: not as promised, or, while reading, failing or ending early.
+    """
+
+    def __init__(self, path: Path, promised: ArrayInfo, first: int = 0, n: int | None = None) -> None:
+        self.dtype = np.dtype(promised.dtype)
+        self._path = path
+        self._n = promised.shape[0] if n is None else n
+        self._begin = data_offset(path, self.dtype, promised.shape) + first * self.dtype.itemsize
+        with _reading(path):
+            self._file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        weakref.finalize(self, os.close, self._file)
+
+    def __len__(self) -> int:
+        return self._n
+
+    def __getitem__(self, part: slice | np.ndarray) -> np.ndarray:
+        """The entries of a slice with both ends, or of (k,) indices, one read each."""
+        if isinstance(part, slice):
+            out = np.empty(part.stop - part.start, self.dtype)
+            self.read_into(part.start, out)
+            return out
+        out = np.empty(len(part), self.dtype)
+        for i, first in enumerate(part.tolist()):
+            self.read_into(first, out[i : i + 1])
+        return out
+
+    def read_into(self, first: int, out: np.ndarray) -> None:
+        """Fill ``out``, contiguous and of the column's type, with the entries from ``first`` on."""
+        data = out.view(np.uint8).data
+        at = self._begin + first * self.dtype.itemsize
+        with _reading(self._path):
+            while data:
+                n_read = os.preadv(self._file, [data], at)
+                if not n_read:
+                    raise StoreError(f"{self._path}: ended early, at byte {at}: it was cut while in use")
+                data, at = data[n_read:], at + n_read
+
+
+Column = np.ndarray | ReadColumn
+"""A column of stored points that may be indexed by a slice with both ends, or by indices."""
 
 
 @contextmanager

@@ -145,19 +145,34 @@ def colour_words(scene: Scene, colouring: Colouring) -> np.ndarray:
             return scene.attribute("rgb")
         case "constant":
             return np.broadcast_to(colouring.word, n)
+    return _by_chunk(n, word_reader(scene, colouring))
+
+
+def word_reader(scene: Scene, colouring: Colouring) -> Callable[[slice], np.ndarray]:
+    """``colour_words`` of a slice, with both ends, of a scene's points: (k,) uint32, in no more memory than that takes.
+
+    Cost: of what it reads of the scene, besides columns of points, once; then one read of the slice at each call.
+    """
+    match colouring.mode:
+        case "rgb":
+            words = scene.column("attr_rgb")
+            return lambda part: words[part]
+        case "constant":
+            return lambda part: np.broadcast_to(colouring.word, part.stop - part.start)
         case "classification":
             palette = _class_palette({**CLASS_COLOURS, **colouring.class_colours})
-            codes = scene.attribute("classification")
-            return _by_chunk(n, lambda part: palette[codes[part]])
+            codes = scene.column("attr_classification")
+            return lambda part: palette[codes[part]]
         case "normal":
-            normals, table = scene.attribute("normal"), _shade_table(up_vector(scene.info))
+            normals, table = scene.column("attr_normal"), _shade_table(up_vector(scene.info))
             bare = shade(np.zeros((1, 3), np.float32), up_vector(scene.info))
-            return _by_chunk(n, lambda part: _shade_words(normals[part], table, bare))
+            return lambda part: _shade_words(normals[part], table, bare)
         case mode:
             values = _scalars(scene, mode)
-            low, high = colouring.value_range or _robust_range(np.asarray(values(_sample(n)), np.float64))
+            sample = values(_sample(scene.info.n_stored)) if colouring.range_is_open else np.empty(0)
+            low, high = colouring.value_range or _robust_range(np.asarray(sample, np.float64))
             table = colormap_words(colouring.colormap)
-            return _by_chunk(n, lambda part: map_scalars(values(part), low, high, table))
+            return lambda part: map_scalars(values(part), low, high, table)
 
 
 def map_scalars(values: np.ndarray, low: float, high: float, table: np.ndarray) -> np.ndarray:
@@ -233,12 +248,13 @@ _Part = slice | np.ndarray
 def _scalars(scene: Scene, mode: str) -> Callable[[_Part], np.ndarray]:
     """The values of a scalar mode, part by part."""
     if mode == "intensity":
-        column = scene.attribute("intensity")
-        return lambda part: column[part]
+        intensity = scene.column("attr_intensity")
+        return lambda part: intensity[part]
     if mode == "elevation":
         up = up_vector(scene.info)
         axis = int(np.abs(up).argmax())
-        sign, column = up[axis], scene.positions()[axis]
+        sign = up[axis]
+        column = scene.positions()[axis] if scene.info.coded else scene.column("xyz"[axis])
         first, origin = scene.blocks()
         return lambda part: sign * (column[part] + origin[_owner(first, part), axis])
     octree = scene.octree()
@@ -275,7 +291,7 @@ def _varies(scene: Scene, name: str) -> bool:
     """Whether the scene has the attribute with more than one value."""
     if name not in scene.info.attributes:
         return False
-    values = scene.attribute(name)[_sample(scene.info.n_stored)]
+    values = scene.column(f"attr_{name}")[_sample(scene.info.n_stored)]
     return bool((values != values[0]).any())
 
 

@@ -11,9 +11,10 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, Field, ValidationError
 
-from .errors import ConfigError
+from .byte_size import parse_bytes
+from .errors import ConfigError, InputError
 from .layer_config import LayerSection
 from .section import Section
 
@@ -23,6 +24,18 @@ PositiveInt = Annotated[int, Field(ge=1)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Ranks = Annotated[int, Field(ge=0, le=65536)]
 
+
+def _byte_size(value: Any) -> str:
+    text = str(value)
+    try:
+        parse_bytes(text, "")
+    except InputError:
+        raise ValueError("expected a size such as 500MB or 4GiB") from None
+    return text
+
+
+ByteSize = Annotated[str, BeforeValidator(_byte_size)]
+"""Text that ``parse_bytes`` takes; a number of bytes will do."""
 
 Topology = Literal[
     "auto",
@@ -116,6 +129,7 @@ class SamplingSection(Section):
     pixel_threshold: Annotated[float, Field(ge=0, le=4096)] = 32.0
     points_per_pixel: Annotated[float, Field(gt=0, le=64)] = 2.0
     pools: Literal["off", "bytes", "time"] = "off"
+    point_budget: Annotated[int, Field(ge=0, lt=2**60)] = 0
 
 
 class RenderSection(Section):
@@ -137,6 +151,20 @@ class RenderSection(Section):
     supersampling: Annotated[int, Field(ge=1, le=8)] = 1
     edl_strength: Annotated[float, Field(ge=0, le=1e6)] = 0.0
     edl_radius_px: Annotated[float, Field(ge=0.5, le=64)] = 1.5
+
+
+class MemorySection(Section):
+    """``[memory]``."""
+
+    residency: Literal["mapped", "paged"] = "mapped"
+    budget: ByteSize = "1GB"
+    prefetch: bool = True
+    complete: bool = False
+
+    @property
+    def budget_bytes(self) -> int:
+        """``budget`` as a number."""
+        return parse_bytes(self.budget, "memory.budget =")
 
 
 class SplatSection(Section):
@@ -192,6 +220,7 @@ class RunConfig(Section):
     culling: CullingSection = CullingSection()
     sampling: SamplingSection = SamplingSection()
     render: RenderSection = RenderSection()
+    memory: MemorySection = MemorySection()
     splats: SplatSection = SplatSection()
     layers: list[LayerSection] = Field(default=[])
     pipeline: PipelineSection = PipelineSection()
@@ -263,7 +292,7 @@ def validated(model: type[AnySection], data: dict[str, Any], source: str) -> Any
 
 
 def _expected(error: Any) -> str:
-    message = error["msg"].removeprefix("Input ")
+    message = error["msg"].removeprefix("Input ").removeprefix("Value error, ")
     message = message.replace("should be", "expected").replace("should have", "expected")
     return message[:1].lower() + message[1:]
 

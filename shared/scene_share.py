@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from .array_source import Column, ReadColumn
 from .messages import RENDER_POINT
 from .octree import Octree
 from .store import PositionReader, Scene
@@ -79,6 +80,13 @@ class SceneShare(Scene):
     def attribute(self, name: str, mmap: bool = True) -> np.ndarray:
         """As of ``Scene``, of the share."""
         return self._whole.attribute(name, mmap)[self._part]
+
+    def column(self, name: str) -> Column:
+        """As of ``Scene``, of the share."""
+        if self._whole.mapped:
+            return self._whole.column(name)[self._part]
+        n = self.info.n_stored
+        return ReadColumn(self.path / f"{name}.npy", self._whole.info.arrays[name], self._first, n)
 
     def blocks(self) -> tuple[np.ndarray, np.ndarray]:
         """As of ``Scene``, those that the share's points stand in; the first may begin before the share."""

@@ -38,7 +38,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .array_source import ArrayFiles, ArraySource
+from .array_source import ArrayFiles, ArraySource, Column, ReadColumn
 from .errors import CodecError, StoreError
 from .octree import FEATURES, MAX_LEVEL, Octree
 from .scene_info import CELL_ARRAYS, SCENE_FILE, ArrayInfo, SceneInfo, parse_info
@@ -58,25 +58,28 @@ class Scene:
 
     path : the directory; of a scene that stands on other arrays, what errors call it.  info : ``SceneInfo``.
     arrays : where its arrays come from; default: the files of the directory.
+    mapped : whether ``column`` maps files, or reads them.
     """
 
-    def __init__(self, path: Path, info: SceneInfo, arrays: ArraySource | None = None) -> None:
+    def __init__(self, path: Path, info: SceneInfo, arrays: ArraySource | None = None, *, mapped: bool = True) -> None:
         self.path = path
         self.info = info
+        self.mapped = mapped
         self._arrays = ArrayFiles(path, info) if arrays is None else arrays
         self._decoded: Callable[[], np.ndarray | None] = lambda: None
 
     @classmethod
-    def open(cls, path: str | Path) -> Scene:
+    def open(cls, path: str | Path, *, mapped: bool = True) -> Scene:
         """The scene in directory ``path``, checked as far as sizes and headers go. Cost: a few milliseconds.
 
+        mapped : whether ``column`` maps files, or reads them.
         Raises StoreError if it is missing, of a newer version, or an array's header or size is not as promised.
         """
         path = Path(path)
         info = parse_info(path / SCENE_FILE)
         files = ArrayFiles(path, info)
         files.check_sizes()
-        return cls(path, info, files)
+        return cls(path, info, files, mapped=mapped)
 
     def octree(self, *, features: bool = False, pools: bool = False) -> Octree:
         """The cells in memory, checksums and links checked, so that kernels may index by them unchecked.
@@ -188,6 +191,16 @@ class Scene:
                 f"{self.path}: attribute {name} not found, expected one of {', '.join(self.info.attributes) or 'none'}"
             )
         return self._load(f"attr_{name}", mmap)
+
+    def column(self, name: str) -> Column:
+        """(n_stored,) array of that name to be indexed: mapped, or read where it is indexed.
+
+        A map keeps what was looked at resident for as long as memory lasts, and the pages around it.
+        Raises StoreError as ``attribute`` does.
+        """
+        if self.mapped:
+            return self._load(name, mmap=True)
+        return ReadColumn(self.path / f"{name}.npy", self.info.arrays[name])
 
     def pool_codes(self) -> np.ndarray:
         """(pool_bytes,) uint8, the pooled forms of cells end to end; a read-only memory map.

@@ -9,6 +9,7 @@ import sys
 import numpy as np
 import pytest
 from splatpipe.shared.build import BuildSettings, build_scene, builder, runs
+from splatpipe.shared.build.holes import punch_hole
 from splatpipe.shared.build.settings import MemoryPlan, resident_bytes
 from splatpipe.shared.errors import InputError
 from splatpipe.shared.points import pack_normals
@@ -160,3 +161,28 @@ def test_memory_is_bounded(tmp_path):
     assert n_partitions > 2
     assert peak < memory * 1.25
     Scene.open(tmp_path / "s").verify()
+
+
+def test_runs_give_back_their_disk_space_as_partitions_are_taken(tmp_path, monkeypatch):
+    """As far as the file system can: what is left of the runs shrinks from partition to partition."""
+    probe = tmp_path / "probe"
+    probe.write_bytes(bytes(1 << 20))
+    punch_hole(probe, 4096, 1 << 19)
+    assert probe.read_bytes() == bytes(1 << 20)
+    if probe.stat().st_blocks * 512 >= 1 << 20:
+        pytest.skip("a file system without holes")
+    held = []
+
+    def add_from_runs(self, runs, partition, n_total):
+        held.append(sum(file.stat().st_blocks * 512 for file in (self.writer.partial / "runs").iterdir()))
+        add(self, runs, partition, n_total)
+
+    add = builder._Build.add_from_runs
+    monkeypatch.setattr(builder._Build, "add_from_runs", add_from_runs)
+    positions = np.random.default_rng(3).uniform(0, 100, (120_000, 3))
+    source = ArraySource(positions, columns_for(len(positions)))
+    report, _ = build(tmp_path, source, MemoryPlan(30_000, 30_000), monkeypatch)
+    assert report.n_partitions > len(held) > 4, "one more for the cells above"
+    assert held == sorted(held, reverse=True)
+    points_left = held[-1] - held[0] + 28 * len(positions)
+    assert points_left < 0.5 * 28 * len(positions), "the files keep their tables of buckets"

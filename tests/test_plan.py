@@ -75,6 +75,7 @@ def test_a_bare_scene_leaves_out_what_it_has_no_use_for(config):
         named.ADAPTIVE,
         "compact positions",
         "pools",
+        named.PAGING,
         "splat passes, normals and radii",
         "quads of flat cells",
         named.COLOUR,

@@ -140,7 +140,8 @@ def test_one_rank_imports_neither_mpi_nor_opengl_nor_what_it_does_not_write(conf
     program = (
         "import sys\nfrom splatpipe.cluster.cli import app\n"
         "try:\n    app(sys.argv[1:])\nexcept SystemExit as end:\n    assert not end.code, end.code\n"
-        "heavy = ('mpi4py', 'moderngl', 'zmq', 'av', 'vtk', 'matplotlib', 'laspy', 'plyfile', 'pye57')\n"
+        "heavy = ('mpi4py', 'moderngl', 'zmq', 'av', 'vtk', 'matplotlib', 'laspy', 'plyfile', 'pye57', "
+        "'splatpipe.nodes.raster.paged', 'splatpipe.nodes.page_reader')\n"
         "print('imported', [name for name in heavy if name in sys.modules])\n"
     )
     settings = {"pipeline.topology": "single", "render.rasterizer": "cpu"}

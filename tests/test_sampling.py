@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from splatpipe.nodes import sampling
 from splatpipe.nodes.culling import CullingNode
 from splatpipe.nodes.pooled_entries import PALETTE_BYTES, PooledForms
-from splatpipe.nodes.sampling import POOLED_POINT_COST, SamplingNode
+from splatpipe.nodes.sampling import POOLED_POINT_COST, SHARES_AN_OCTAVE, SamplingNode
 from splatpipe.shared.camera import look_at, perspective_camera
 from splatpipe.shared.errors import ConfigError, MessageError
 from splatpipe.shared.messages import VisibilityBits, decode_render_points, encode
@@ -30,8 +30,8 @@ def projected_pixels(octree, camera, cell):
     return (2 * half * camera.focal_px / distance) ** 2
 
 
-def cut_twin(octree, camera, visible, threshold):
-    """{cell: points to draw}, by recursion from the root."""
+def cut_twin(octree, camera, visible, threshold, share=1.0):
+    """{cell: points to draw}, by recursion from the root; ``share`` of the points a pixel."""
     drawn = {}
     stratified = octree.area is not None
 
@@ -43,7 +43,7 @@ def cut_twin(octree, camera, visible, threshold):
     def visit(cell):
         if not visible[cell]:
             return
-        n_pixels = projected_pixels(octree, camera, cell)
+        n_pixels = share * projected_pixels(octree, camera, cell)
         small = n_pixels <= threshold**2
         n_points = int(octree.n_points[cell])
         if octree.is_leaf[cell]:
@@ -344,3 +344,60 @@ def test_a_message_with_pooled_points_comes_back_and_is_counted(scene, threshold
 def test_pools_need_an_octree_that_has_them(small):
     with pytest.raises(ConfigError, match=r"sampling.pools = 'bytes': the octree was loaded without pooled forms"):
         SamplingNode(small[0], pixel_threshold=1.0, pools="bytes")
+
+
+# --- a budget of points ------------------------------------------------------------------------------------------
+
+
+def thinned_twin(octree, camera, visible, threshold, share):
+    """Points that the cut draws at this share of the points a pixel."""
+    drawn = cut_twin(octree, camera, visible, threshold, share)
+    return sum(len(points_of(octree, cell, n)) for cell, n in drawn.items())
+
+
+@EXAMPLES
+@given(scenes(), THRESHOLDS.filter(bool), st.booleans(), st.integers(1, 400))
+def test_a_budget_is_kept_by_a_share_whose_larger_neighbour_does_not(scene, threshold, stratified, budget):
+    cloud, camera = scene
+    octree = with_areas(cloud.octree) if stratified else cloud.octree
+    bits = CullingNode(octree, backface=False).process(camera)
+    free = SamplingNode(octree, pixel_threshold=threshold, points_per_pixel=DENSITY)
+    node = SamplingNode(octree, pixel_threshold=threshold, points_per_pixel=DENSITY, point_budget=budget)
+    unlimited, limited = free.process(camera, bits), node.process(camera, bits)
+    assert limited.n_points <= budget
+    np.testing.assert_array_equal(limited.entries, node.process(camera, bits).entries)
+    if unlimited.n_points <= budget:
+        np.testing.assert_array_equal(limited.entries, unlimited.entries)
+        return
+
+    def count(step):
+        return thinned_twin(octree, camera, bits.unpack(), threshold, 2.0 ** (-step / SHARES_AN_OCTAVE))
+
+    assert free.step == 0 < node.step
+    assert limited.n_points == count(node.step)
+    assert count(node.step - 1) > budget, "a larger share is above the budget"
+
+
+def test_a_camera_decides_alone_whatever_was_drawn_before():
+    positions = np.random.default_rng(5).uniform(0, 1, (3000, 3))
+    octree = with_areas(build_cloud(positions, positions, point_order="layered").octree)
+    node = SamplingNode(octree, pixel_threshold=30, points_per_pixel=8.0, point_budget=500)
+    culling = CullingNode(octree, backface=False)
+    poses = [look_at([x, 0.5, 0.5], [0.0, 0.5, 0.5], np.array([0.0, 0.0, 1.0])) for x in (1.5, 3.0, 9.0, 1.5)]
+    cameras = [
+        perspective_camera(frame=4, world_from_camera=pose, fov_y_rad=1.0, width=64, height=64, near=0.1)
+        for pose in poses
+    ]
+    drawn = [node.process(camera, culling.process(camera)).entries for camera in cameras]
+    np.testing.assert_array_equal(drawn[0], drawn[3])
+
+
+@pytest.mark.parametrize(
+    ("options", "found"),
+    [({"whole_sets": True}, "sets drawn whole"), ({"pixel_threshold": 0.0}, "threshold 0")],
+)
+def test_a_budget_of_points_that_cannot_be_thinned_out_is_refused(options, found):
+    positions = np.random.default_rng(1).uniform(0, 1, (300, 3))
+    octree = build_cloud(positions, positions, point_order="layered").octree
+    with pytest.raises(ConfigError, match=f"sampling.point_budget = 9: found {found}"):
+        SamplingNode(octree, **{"pixel_threshold": 1.0, "point_budget": 9} | options)

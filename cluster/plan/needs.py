@@ -26,6 +26,7 @@ from .part import (
     MPI,
     NO_NORMALS,
     OPENGL,
+    PAGING,
     SPLAT_LOOP,
     Part,
 )
@@ -54,6 +55,7 @@ def parts(job: Job, work: Workload, decision: Decision) -> list[Part]:
         _adaptive_size(job, work),
         _compact_positions(job),
         _pools(job, work),
+        _paging(job),
         _splats(job, work),
         _quads(job, work),
         _colour(job),
@@ -259,6 +261,17 @@ def _pools(job: Job, work: Workload) -> Part:
     return Part("pools", False, why, size_mb, "MB read", "counted")
 
 
+def _paging(job: Job) -> Part:
+    memory = job.config.memory
+    if not job.paged:
+        why = "memory.residency is mapped: what was drawn stays resident as far as memory goes"
+        return Part(PAGING, True, why, None, "bytes read/frame")
+    whole_mb = 1e-6 * job.scene.info.n_stored * (job.position_bytes + job.attribute_bytes)
+    why = f"memory.residency is paged: a pool of {memory.budget} for {whole_mb:,.0f} MB of points; frames "
+    why += "wait for theirs" if memory.complete else "are drawn from those that are there"
+    return Part(PAGING, False, why, None, "bytes read/frame")
+
+
 def _splats(job: Job, work: Workload) -> Part:
     cost_ms = (COSTS.splat_s - COSTS.point_s) * work.points * 1e3
     why = f"render.style is {job.config.render.style}"
@@ -313,6 +326,11 @@ def _checksums(job: Job) -> Part:
     info = job.scene.info
     read = (*info.position_arrays, *(f"attr_{name}" for name in job.attributes_read))
     cost_s = COSTS.checksum_s * sum(info.arrays[name].bytes for name in read)
+    if job.paged:
+        why = (
+            "memory.residency is paged: points are not read at the start; headers, sizes, cells and blocks are checked"
+        )
+        return Part(CHECKSUMS, True, why, cost_s, "s of loading")
     if job.config.scene.verify:
         return Part(CHECKSUMS, False, "scene.verify is true: damage is named, not drawn", cost_s, "s of loading")
     return Part(CHECKSUMS, True, "scene.verify is false", cost_s, "s of loading")

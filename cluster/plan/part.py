@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 MPI, OPENGL, PNG, FILM = "MPI", "OpenGL", "PNG encoding", "film encoding"
-LAYERS = "layers"
+LAYERS, PAGING = "layers", "paging of points"
 NO_NORMALS, BACK_FACE = "normals and back-face test", "back-face test"
 LEVEL_OF_DETAIL, SPLAT_LOOP, ADAPTIVE = "level of detail", "splat loop and attenuation", "adaptive point size"
 COLOUR, COLOUR_MAPS, CHECKSUMS = "colour column", "colour maps", "checksums"

@@ -9,13 +9,14 @@ from . import PointSize, Rasterizer, ResidentPoints, SplatSettings
 
 if TYPE_CHECKING:
     from .group_raster import ResidentGroups
+    from .paged_points import PagedPoints
 
 RASTERIZERS = ("auto", "cpu", "gl", "gl-points")
 
 
 def make_rasterizer(
     name: str,
-    points: ResidentPoints | ResidentGroups,
+    points: ResidentPoints | ResidentGroups | PagedPoints,
     width: int,
     height: int,
     size: PointSize,
@@ -24,7 +25,8 @@ def make_rasterizer(
     splats: SplatSettings | None = None,
     compact: bool = False,
 ) -> Rasterizer:
-    """A rasterizer over ``points``; the caller closes it (it is a context manager). Linear groups are drawn by ``cpu``.
+    """A rasterizer over ``points``; the caller closes it (it is a context manager). ``cpu`` draws linear
+    groups and paged points.
 
     name : one of ``RASTERIZERS``. ``auto`` takes ``gl`` where a GPU draws it and ``cpu`` elsewhere: OpenGL in software
         is slower than the compiled kernels.
@@ -35,6 +37,12 @@ def make_rasterizer(
     there.
     """
     if not isinstance(points, ResidentPoints):
+        from .paged_points import PagedPoints
+
+        if isinstance(points, PagedPoints):
+            from .paged import PagedCpuRasterizer
+
+            return PagedCpuRasterizer(points, width, height, size, threads)
         from .group_raster import CpuGroupRasterizer
 
         check_style(name, splats, groups=True)

@@ -91,10 +91,11 @@ class CpuRasterizer(FramebufferRasterizer):
         return self._draw_frame(camera, n_points, *work)
 
 
-def kernels_cached(*, pools: bool = False, groups: bool = False) -> bool:
+def kernels_cached(*, pools: bool = False, groups: bool = False, paged: bool = False) -> bool:
     """Whether the first frame will load the kernels instead of compiling them (some seconds).
 
     pools : whether pools are drawn, too.  groups : whether linear groups are drawn instead.
+    paged : whether points are paged.
     True if the compiled files are younger than the source, as far as numba's cache folder tells.
     """
     from . import pieces
@@ -109,6 +110,10 @@ def kernels_cached(*, pools: bool = False, groups: bool = False) -> bool:
 
         return cached(draw_groups) and cached(kernels.merge)
     needed = [kernels.draw, kernels.merge, pieces._split]
+    if paged:
+        from . import page_pieces
+
+        needed[-1] = page_pieces._cut
     if pools:
         from .pools import draw_pools
 

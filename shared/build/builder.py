@@ -56,7 +56,7 @@ def build_scene(
     partition by partition; cells, sets and their order are the same for any memory and any number of threads, the
     place of a cell's range in the point-array is not. Neighbours, for normals and radii, are searched inside a
     partition: next to its faces radii are a little larger and normals less exact than in memory. The runs take as much
-    disk as the points, beside the scene.
+    disk as the points, which is given back, as far as the file system can, while the scene is written.
     A build that was killed is started again from clean.
     Raises InputError for inputs that cannot be used, a target that must not be replaced, or a full disk; nothing is
     left behind then.
@@ -125,6 +125,7 @@ class Build:
                 self.add_partition(held, keys_of(held.positions, origin, edge, self.workers), 0, 0, tally.n_points)
             else:
                 for partition in runs.partitions(self.memory.capacity):
+                    runs.release_before(partition)
                     self.add_from_runs(runs, partition, tally.n_points)
                 runs.discard()
             with self.timed("write"):

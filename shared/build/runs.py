@@ -5,6 +5,9 @@ raw file a column. A *partition* is a cell of the octree whose points fit; they 
 below the bucket level, the points of that slice whose key has the cell's code for a prefix. Read run after run they
 stand in the order that one sort in memory would have given them: the scene does not depend on the memory it was built
 in.
+
+Partitions are taken in the order of their codes, so what lies in front of one in every run is not read again: its
+disk space is given back while the scene grows.
 """
 
 from __future__ import annotations
@@ -17,8 +20,9 @@ import numpy as np
 from numba import njit
 
 from ..octree import MAX_LEVEL
-from ..points import PointBatch
+from ..points import ATTRIBUTES, PointBatch
 from .flatness import N_MOMENTS, add_moments, bucket_moments, central_moments, flatness
+from .holes import punch_hole
 from .ingest import Columns
 from .morton import count_buckets, keys_of
 from .parallel import Workers
@@ -73,6 +77,7 @@ class Runs:
         self.counts = np.zeros(_N_BUCKETS, np.int64)
         self.moments = np.zeros((_N_BUCKETS, N_MOMENTS), np.int64) if rule.flatness > 0 else None
         self._ahead: dict[tuple[int, int], np.ndarray] = {}
+        self._released = 0
         self.bytes = 0
         with writing(directory):
             directory.mkdir()
@@ -116,6 +121,16 @@ class Runs:
         """
         self._runs = [directory / f"{run:05d}" for directory, n_runs in directories for run in range(n_runs)]
         self.counts, self.moments = counts, moments
+
+    def release_before(self, partition: Partition) -> None:
+        """Give back the disk space of all points in front of the bucket that a partition begins in."""
+        begin, _ = _buckets(partition.level, partition.code)
+        if begin == self._released:
+            return
+        for run, start, stop in self._slices(self._released, begin):
+            for name, row_bytes in (("positions", 24), *((a, ATTRIBUTES[a].itemsize) for a in self.attributes)):
+                punch_hole(_file(run, name), start * row_bytes, (stop - start) * row_bytes)
+        self._released = begin
 
     def _write_column(self, run: Path, name: str, column: np.ndarray, ids: np.ndarray) -> None:
         out = np.empty((_CHUNK, *column.shape[1:]), column.dtype)
