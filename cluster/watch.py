@@ -32,6 +32,8 @@ TAG = "SPLATPIPE_RUN"
 RANK_VARIABLES = ("PMI_RANK", "PMIX_RANK", "OMPI_COMM_WORLD_RANK")
 MPIEXEC_ENDS_S = 3.0
 """How long ``mpiexec`` has to end the other ranks when one has died or failed; then the launcher does it."""
+MPI_ENDS_S = 10.0
+"""How long ranks have that have done all their work; a death would leave the others waiting for it in MPI_Finalize."""
 BEAT_S = 5.0
 LEAST_SILENCE_S = 30.0
 """A rank on another host that is not heard of for this long, or for ``timeout_s`` if that is longer, is lost."""
@@ -169,6 +171,10 @@ class Watch:
     def failed(self) -> None:
         """A rank has failed and said why: the run must end soon."""
         self._deadline = min(self._deadline, time.monotonic() + MPIEXEC_ENDS_S)
+
+    def over(self) -> None:
+        """All ranks have done their work together: none may keep the others waiting at the end of MPI."""
+        self._deadline = min(self._deadline, time.monotonic() + MPI_ENDS_S)
 
     def first_dead(self) -> int | None:
         """Process id of the rank that died first."""
