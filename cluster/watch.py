@@ -107,6 +107,15 @@ def processes_of(tag: str) -> Iterator[tuple[int, str]]:
                     yield int(entry.name), state
 
 
+def _rank_of(pid: int) -> str:
+    """Number of a rank that has said nothing yet, by its environment; empty if the process is no rank."""
+    with suppress(OSError):
+        variables = Path(f"/proc/{pid}/environ").read_bytes().decode(errors="replace").split("\0")
+        found = dict(variable.partition("=")[::2] for variable in variables)
+        return next((found[name] for name in RANK_VARIABLES if name in found), "")
+    return ""
+
+
 def end_all(tag: str, patience_s: float = 5.0) -> None:
     """Kill every process of a run on this host, stopped ones too, and wait until they have gone."""
     end = time.monotonic() + patience_s
@@ -191,8 +200,9 @@ class Watch:
             return f"mpiexec (pid {pid})"
         if pid in self._ranks:
             return f"rank {self._ranks[pid]['rank']} ({self._ranks[pid]['role']}, pid {pid})"
-        if pid in self._numbers:
-            return f"rank {self._numbers[pid]} (starting, pid {pid})"
+        number = self._numbers.get(pid) or _rank_of(pid)
+        if number:
+            return f"rank {number} (starting, pid {pid})"
         return f"a process of mpiexec (pid {pid})"
 
     def _run(self) -> None:
