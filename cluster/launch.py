@@ -41,7 +41,8 @@ _REMEDY = {
     "srun": "try srun --mpi=pmix (Open MPI) or srun --mpi=pmi2 (MPICH); srun --mpi=list says what there is",
 }
 _NOISE = re.compile(
-    r"^(NBC_Progress: .*|Error in NBC_.*|=+|=   .*|Abort\(\d+\) on node .*|YOUR APPLICATION TERMINATED .*|This typically refers .*|"
+    r"^(NBC_Progress: .*|Error in NBC_.*|"
+    r"=+|=   .*|Abort\(\d+\) on node .*|YOUR APPLICATION TERMINATED .*|This typically refers .*|"
     r"Please see the FAQ .*|)$"
 )
 

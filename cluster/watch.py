@@ -111,7 +111,7 @@ def _rank_of(pid: int) -> str:
     """Number of a rank that has said nothing yet, by its environment; empty if the process is no rank."""
     with suppress(OSError):
         variables = Path(f"/proc/{pid}/environ").read_bytes().decode(errors="replace").split("\0")
-        found = dict(variable.partition("=")[::2] for variable in variables)
+        found = {variable.partition("=")[0]: variable.partition("=")[2] for variable in variables}
         return next((found[name] for name in RANK_VARIABLES if name in found), "")
     return ""
 
