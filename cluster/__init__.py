@@ -5,6 +5,7 @@ cli                      the command line: one function a command
 run, job                 a run, made ready
 layout, topologies       which rank culls, samples and draws what; what a topology refuses
 pipeline, selection      the frame loop of a rank; its part of the octree
+coordinator, drawn       starting frames; what ranks say of those they have drawn
 compositing/             framebuffers of tiles and shares meet
 frame_parallel, film     each rank draws whole pictures; one film of them
 wall                     each rank draws and writes a screen of a display wall

@@ -14,10 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from ..shared.messages import Kind
+from .coordinator import Progress
+from .drawn import Drawn
 from .film import GatheredFilm, SentFilm
 from .job import Job
 from .layout import ALONE
-from .pipeline import Drawn, FrameLoop, Progress
+from .pipeline import FrameLoop
 from .record import FrameCounts, StageClock, rank_record, summed_traffic
 from .sink import Film
 from .transport import Transport

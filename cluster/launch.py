@@ -41,7 +41,8 @@ _REMEDY = {
     "srun": "try srun --mpi=pmix (Open MPI) or srun --mpi=pmi2 (MPICH); srun --mpi=list says what there is",
 }
 _NOISE = re.compile(
-    r"^(NBC_Progress: .*|=+|=   .*|Abort\(\d+\) on node .*|YOUR APPLICATION TERMINATED .*|This typically refers .*|"
+    r"^(NBC_Progress: .*|Error in NBC_.*|"
+    r"=+|=   .*|Abort\(\d+\) on node .*|YOUR APPLICATION TERMINATED .*|This typically refers .*|"
     r"Please see the FAQ .*|)$"
 )
 
@@ -222,6 +223,7 @@ class _Relay:
         self._on_record = on_record
         self._watch = watch
         self._failed: int | None = None  # exit status of the first rank that said why
+        self._done: int | None = None  # exit status on which all ranks agree
         self._tail: deque[str] = deque(maxlen=40)
 
     def run(self) -> int:
@@ -237,6 +239,8 @@ class _Relay:
         status = self._process.wait()
         self._watch.finish()
         reader.join(5)
+        if self._failed is None and self._done is not None:
+            return self._done
         if self._failed is None and (status != 0 or self._watch.verdict):
             raise SplatpipeError(self._watch.verdict or self._obituary(status))
         return self._failed or status
@@ -256,6 +260,9 @@ class _Relay:
                     file=sys.stderr,
                 )
                 self._watch.failed()
+        elif "done" in content and "doing" not in content:
+            self._done = content["done"]
+            self._watch.over()
         elif "beat" in content:
             self._watch.heard(content["beat"], content["lives"])
         elif "pid" in content:

@@ -12,9 +12,8 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -37,10 +36,12 @@ from ..shared.scene_share import SceneShare
 from .balance import can_balance, is_on
 from .compositing import make_compositor
 from .compositing.tiles import Tiles
+from .coordinator import Coordinator, Progress
 from .delivery import receive_scene, serve_scene
+from .drawn import STAGES, Drawn, merged, told_of
 from .job import Job, RenderStage
 from .layout import ALONE, Layout, Plan
-from .record import FrameCounts, StageClock, rank_record, spread_ms, summed_traffic, with_missing
+from .record import FrameCounts, StageClock, rank_record
 from .selection import CullingPart, LaneCells, SamplingPart, first_plan, merged_entries, shares_of, with_borders
 from .transport import Transport
 from .wall import screen_windows, writes_screens
@@ -49,46 +50,8 @@ if TYPE_CHECKING:
     from .balance.balancer import Balancer
     from .balance.times import StageTimes, TimesTeller
 
-STAGES = ("culling", "sampling", "render", "compositing", "picture")
 CULLING, SAMPLING, RENDER = range(3)
 """Ranks of a chain of three, where a scene is delivered by messages."""
-
-Progress = Callable[[str, int], None]
-"""Called with what is going on and how many frames are done."""
-
-
-@dataclass(frozen=True)
-class Drawn:
-    """What a rank has to say of its frames.
-
-    clocks : of its stages.  times : of encoding, by kind of output.  held : what its record says beside the rest.
-    latency_s : on the coordinator, of each frame.
-    started, drawn : when the first frame began and the last one was drawn (``time.perf_counter``).
-    """
-
-    clocks: list[StageClock]
-    counts: FrameCounts
-    times: dict[str, list[float]]
-    rasterizer: str
-    held: dict[str, Any]
-    latency_s: list[float]
-    loading_s: float
-    started: float
-    drawn: float
-
-    def record(self) -> dict[str, Any]:
-        """The statistics of a run of these frames, but for its ranks and messages."""
-        return {
-            "rasterizer": self.rasterizer,
-            "stages": {clock.stage: clock.summary() for clock in self.clocks},
-            "latency_ms": spread_ms(self.latency_s),
-            "per_frame": with_missing(
-                {f"{clock.stage}_s": clock.work_s for clock in self.clocks} | self.counts.lists() | self.times
-            ),
-            "loading_s": self.loading_s,
-            "rendered_s": self.drawn - self.started,
-            "finished_s": time.perf_counter() - self.started,
-        }
 
 
 def run_single(job: Job, progress: Progress) -> dict[str, Any]:
@@ -101,7 +64,7 @@ def run_layout(job: Job, layout: Layout, transport: Transport, progress: Progres
     """Do this rank's part of a layout; the statistics of the run on rank 0, None elsewhere. Collective."""
     loop = FrameLoop(job, layout, transport, progress)
     drawn = loop.run()
-    told = _told(layout, drawn, transport)
+    told = told_of(layout, drawn, transport)
     screens = bool(screen_windows(job, layout))
     if can_balance(layout, screens):
         told |= {"taken_s": loop.taken_s(), "adopting_s": loop.adopting_s}
@@ -109,7 +72,7 @@ def run_layout(job: Job, layout: Layout, transport: Transport, progress: Progres
     if transport.rank == 0:
         others = [rank for rank in layout.workers if rank]
         all_told = [told, *(transport.receive_note(rank, Kind.STATISTICS)[1] for rank in others)]
-        result = _merged(drawn, all_told)
+        result = merged(drawn, all_told)
         if can_balance(layout, screens) and len(job.frames):
             from .balance.summary import balance_record
 
@@ -472,111 +435,3 @@ class FrameLoop:
         assert self._transport
         limit = most * RENDER_POINT.itemsize
         return decode_render_points(*self._transport.receive(rank, Kind.RENDER_POINTS, limit))
-
-
-class Coordinator:
-    """Starts frames on the other ranks, few enough at a time, and hears when they are done. On rank 0.
-
-    balancer : has the plan of each frame; None: the first one holds.
-    plans : by number, those that frames were started by and that this rank has not adopted yet.
-    """
-
-    def __init__(
-        self, job: Job, layout: Layout, transport: Transport | None, plan: Plan, balancer: Balancer | None = None
-    ) -> None:
-        self._job, self._transport, self._plan, self._balancer = job, transport, plan, balancer
-        self.plans: dict[int, Plan] = {}
-        self._others = [rank for rank in layout.workers if rank]
-        self._display = layout.display
-        self._ahead = job.frames_in_flight if self._others else 1 + job.frames_ahead
-        self._starts: list[FrameStart] = []
-        self._issued_s: list[float] = []
-        self.latency_s: list[float] = []
-
-    def start(self, i: int, progress: Progress) -> FrameStart:
-        """Frame ``i`` as this rank is to do it, once it may start; as many others as may start have been started."""
-        self._issue()
-        while len(self._starts) <= i or self._has_done():
-            self._hear(progress)
-            self._issue()
-        return self._starts[i]
-
-    def finished(self) -> None:
-        """Take note that the display has finished the next frame."""
-        self.latency_s.append(time.perf_counter() - self._issued_s[len(self.latency_s)])
-
-    def finish(self, progress: Progress) -> None:
-        """Hear of every frame that is still to be finished."""
-        while len(self.latency_s) < len(self._job.frames):
-            self._hear(progress)
-
-    def _issue(self) -> None:
-        frames = self._job.frames
-        while len(self._starts) < min(len(frames), len(self.latency_s) + self._ahead):
-            if self._balancer:
-                self._change_to(self._balancer.plan_for(len(self._starts), self._plan))
-            start = FrameStart(self._job.camera(frames[len(self._starts)]), self._plan.number)
-            for rank in self._others:
-                assert self._transport
-                self._transport.send(rank, start)
-            self._starts.append(start)
-            self._issued_s.append(time.perf_counter())
-
-    def _change_to(self, plan: Plan) -> None:
-        if plan is self._plan:
-            return
-        self._plan = self.plans[plan.number] = plan
-        for rank in self._others:
-            assert self._transport
-            self._transport.send_note(rank, Kind.PLAN, 0, plan.to_note())
-
-    def _has_done(self) -> bool:
-        return bool(self._display and self._transport and self._transport.has_note(self._display, Kind.FRAME_DONE))
-
-    def _hear(self, progress: Progress) -> None:
-        assert self._transport
-        self._transport.receive_note(self._display, Kind.FRAME_DONE)
-        self.finished()
-        progress("rendering", len(self.latency_s))
-
-
-def _told(layout: Layout, drawn: Drawn, transport: Transport) -> dict[str, Any]:
-    """What rank 0 is told of a rank, JSON-able."""
-    record = rank_record(layout.role_of(transport.rank), transport.rank) | drawn.held
-    record |= {"stages": {clock.stage: clock.summary() for clock in drawn.clocks}, "loading_s": drawn.loading_s}
-    return {
-        "rank": record,
-        "work_s": {clock.stage: clock.work_s for clock in drawn.clocks},
-        "wait_s": {clock.stage: sum(clock.wait_s) for clock in drawn.clocks},
-        "counts": drawn.counts.lists(),
-        "times": drawn.times,
-        "rasterizer": drawn.rasterizer,
-        "messages": transport.traffic(),
-    }
-
-
-def _merged(drawn: Drawn, told: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """The statistics of the run of what each rank told: a stage takes as long as the slowest of its ranks."""
-    clocks = []
-    for stage in STAGES:
-        having = [of for of in told if stage in of["work_s"]]
-        if having:
-            clock = StageClock(stage)
-            clock.work_s = np.max([of["work_s"][stage] for of in having], axis=0).tolist()
-            clock.wait_s = [min(of["wait_s"][stage] for of in having)]
-            clocks.append(clock)
-    counts: dict[str, list[Any]] = {}
-    for of in told:
-        for name, values in of["counts"].items():
-            counts[name] = np.add(counts[name], values).tolist() if name in counts else values
-    names = dict.fromkeys(name for of in told for name in of["times"])
-    times = {name: [s for of in told for s in of["times"].get(name, [])] for name in names}
-    rasterizer = next(of["rasterizer"] for of in told if of["rasterizer"])
-    per_frame = with_missing({f"{clock.stage}_s": clock.work_s for clock in clocks} | counts | times)
-    return drawn.record() | {
-        "rasterizer": rasterizer,
-        "stages": {clock.stage: clock.summary() for clock in clocks},
-        "per_frame": per_frame,
-        "ranks": [of["rank"] for of in told],
-        "messages": summed_traffic(of["messages"] for of in told),
-    }

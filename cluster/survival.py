@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from ..shared.config import RunConfig
+from .launch import record
 from .topologies import role_of
 from .transport import Transport
 
@@ -54,6 +55,7 @@ class Survival:
                     raise
                 failed = error
             if transport.unanimous(failed is None):
+                record(done=status)
                 return status
             lost = transport.go_on()
             if failed and not lost:

@@ -32,6 +32,8 @@ TAG = "SPLATPIPE_RUN"
 RANK_VARIABLES = ("PMI_RANK", "PMIX_RANK", "OMPI_COMM_WORLD_RANK")
 MPIEXEC_ENDS_S = 3.0
 """How long ``mpiexec`` has to end the other ranks when one has died or failed; then the launcher does it."""
+MPI_ENDS_S = 10.0
+"""How long ranks have that have done all their work; a death would leave the others waiting for it in MPI_Finalize."""
 BEAT_S = 5.0
 LEAST_SILENCE_S = 30.0
 """A rank on another host that is not heard of for this long, or for ``timeout_s`` if that is longer, is lost."""
@@ -105,6 +107,15 @@ def processes_of(tag: str) -> Iterator[tuple[int, str]]:
                     yield int(entry.name), state
 
 
+def _rank_of(pid: int) -> str:
+    """Number of a rank that has said nothing yet, by its environment; empty if the process is no rank."""
+    with suppress(OSError):
+        variables = Path(f"/proc/{pid}/environ").read_bytes().decode(errors="replace").split("\0")
+        found = {variable.partition("=")[0]: variable.partition("=")[2] for variable in variables}
+        return next((found[name] for name in RANK_VARIABLES if name in found), "")
+    return ""
+
+
 def end_all(tag: str, patience_s: float = 5.0) -> None:
     """Kill every process of a run on this host, stopped ones too, and wait until they have gone."""
     end = time.monotonic() + patience_s
@@ -170,6 +181,10 @@ class Watch:
         """A rank has failed and said why: the run must end soon."""
         self._deadline = min(self._deadline, time.monotonic() + MPIEXEC_ENDS_S)
 
+    def over(self) -> None:
+        """All ranks have done their work together: none may keep the others waiting at the end of MPI."""
+        self._deadline = min(self._deadline, time.monotonic() + MPI_ENDS_S)
+
     def first_dead(self) -> int | None:
         """Process id of the rank that died first."""
         return self._dead[0] if self._dead else None
@@ -185,8 +200,9 @@ class Watch:
             return f"mpiexec (pid {pid})"
         if pid in self._ranks:
             return f"rank {self._ranks[pid]['rank']} ({self._ranks[pid]['role']}, pid {pid})"
-        if pid in self._numbers:
-            return f"rank {self._numbers[pid]} (starting, pid {pid})"
+        number = self._numbers.get(pid) or _rank_of(pid)
+        if number:
+            return f"rank {number} (starting, pid {pid})"
         return f"a process of mpiexec (pid {pid})"
 
     def _run(self) -> None:

@@ -13,11 +13,9 @@ from pathlib import Path
 import pytest
 from splatpipe.cluster import watch
 from splatpipe.cluster.launch import _options, check_started, check_starter, find_mpiexec, inside_mpi, mpi_available
-from splatpipe.cluster.topologies import topology_of_survivors
 from splatpipe.cluster.watch import processes_of
 from splatpipe.nodes.raster import gl_context
 from splatpipe.shared.build import BuildSettings, build_scene
-from splatpipe.shared.config import load_config
 from splatpipe.shared.errors import InputError
 from splatpipe.shared.synth import CityScan
 
@@ -179,11 +177,11 @@ def test_random_faults_break_no_promise(tmp_path, topology):
 @pytest.mark.mpi
 @pytest.mark.skipif(not survives(), reason="no Open MPI 5 with ULFM beside this Python")
 @pytest.mark.parametrize(
-    ("topology", "victim", "goes_on_as"),
-    [("pipelined", 2, "single"), ("pipelined", 0, "single"), ("sort-last-only", 1, "sort-last-only")],
+    ("topology", "victim"),
+    [("pipelined", 2), ("pipelined", 0), ("sort-last-only", 1)],
 )
 @pytest.mark.parametrize("name", ["SIGKILL", "SIGSTOP"])
-def test_a_rank_is_survived_and_no_frame_is_lost(config, tmp_path, topology, victim, goes_on_as, name):
+def test_a_rank_is_survived_and_no_frame_is_lost(config, tmp_path, topology, victim, name):
     pictures = {}
     for out in ("whole", "hit"):
         sets = ["output.frames=300", "output.mp4=true", "pipeline.survive=true"]
@@ -197,23 +195,12 @@ def test_a_rank_is_survived_and_no_frame_is_lost(config, tmp_path, topology, vic
         assert run.process.returncode == 0, said
         pictures[out] = {path.name: path.read_bytes() for path in (tmp_path / out).glob("frame_*.png")}
     assert pictures["hit"] == pictures["whole"]
-    assert re.fullmatch(rf"splatpipe: rank {victim} \(\w+, pid {pid}\) died; the others go on\n", said), said
+    assert re.fullmatch(rf"splatpipe: rank {victim} \([^,]+, pid {pid}\) died; the others go on\n", said), said
     record = json.loads((tmp_path / "hit" / "run.json").read_text())
     (lost,) = record["lost"]
-    assert (lost["rank"], lost["pid"], record["topology"]) == (victim, pid, goes_on_as)
+    assert (lost["rank"], lost["pid"], record["topology"]) == (victim, pid, topology)
     assert (record["frames"], record["kept"], record["drawn"]) == (300, 0, 300)
     assert (tmp_path / "hit" / "film.mp4").stat().st_size > 1000
-
-
-def test_survivors_need_no_more_memory_than_before(config):
-    for topology, size, expected in (
-        ("pipelined", 3, "pipelined"),
-        ("pipelined", 2, "single"),
-        ("sort-last-only", 1, "sort-last-only"),
-        ("frame-parallel", 2, "frame-parallel"),
-    ):
-        settings = load_config(config, [f"pipeline.topology={topology}"])
-        assert topology_of_survivors(settings, size) == expected
 
 
 # --- started by another MPI, or by none ---------------------------------------------------------------------------

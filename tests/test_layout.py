@@ -9,9 +9,10 @@ from helpers_octree import scenes as octree_scenes
 from helpers_ranks import World
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from splatpipe.cluster.drawn import STAGES
 from splatpipe.cluster.job import Job
 from splatpipe.cluster.layout import Plan, chains, hybrid, master_slave
-from splatpipe.cluster.pipeline import STAGES, run_layout, run_single
+from splatpipe.cluster.pipeline import run_layout, run_single
 from splatpipe.cluster.topologies import check_world, layout_of, ranks_to_start
 from splatpipe.nodes.culling import CullingNode
 from splatpipe.nodes.sampling import SamplingNode
