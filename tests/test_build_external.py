@@ -177,8 +177,8 @@ def test_runs_give_back_their_disk_space_as_partitions_are_taken(tmp_path, monke
         held.append(sum(file.stat().st_blocks * 512 for file in (self.writer.partial / "runs").iterdir()))
         add(self, runs, partition, n_total)
 
-    add = builder._Build.add_from_runs
-    monkeypatch.setattr(builder._Build, "add_from_runs", add_from_runs)
+    add = builder.Build.add_from_runs
+    monkeypatch.setattr(builder.Build, "add_from_runs", add_from_runs)
     positions = np.random.default_rng(3).uniform(0, 100, (120_000, 3))
     source = ArraySource(positions, columns_for(len(positions)))
     report, _ = build(tmp_path, source, MemoryPlan(30_000, 30_000), monkeypatch)
