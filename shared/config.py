@@ -157,7 +157,7 @@ class PipelineSection(Section):
     sampling_ranks: Ranks = 0
     render_ranks: Ranks = 0
     render_split: Literal["tiles", "shares"] = "tiles"
-    balance: Literal["off", "measured"] = "off"
+    balance: Literal["off", "measured"] = "measured"
     frames_in_flight: Annotated[int, Field(ge=1, le=64)] = 4
     compositing: Literal["auto", "direct", "direct-reduce", "binary-swap", "radix-k", "mpi-min"] = "auto"
     radix: Annotated[int, Field(ge=2, le=1024)] = 8

@@ -1,5 +1,6 @@
 """Load balance: borders move to where the work is, come to rest, and never change a picture."""
 
+import io
 import json
 import subprocess
 import sys
@@ -12,12 +13,14 @@ import pytest
 from helpers_ranks import World
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rich.console import Console
 from splatpipe.cluster.balance import balancer, can_balance, is_on, times
 from splatpipe.cluster.balance.balancer import Balancer, make_policies
 from splatpipe.cluster.balance.hysteresis import Hysteresis, imbalance
 from splatpipe.cluster.balance.subtrees import SubtreeBorders, learned
 from splatpipe.cluster.balance.tiles import GRID, CostGrid, moved_tiles
 from splatpipe.cluster.balance.times import FRAMES_A_NOTE, StageTimes, TimesTeller
+from splatpipe.cluster.bench.balance import bench_balance, print_balance
 from splatpipe.cluster.job import Job
 from splatpipe.cluster.launch import find_mpiexec, mpi_available
 from splatpipe.cluster.layout import Layout, Plan, chains, hybrid, master_slave
@@ -26,9 +29,10 @@ from splatpipe.cluster.record import StageClock
 from splatpipe.cluster.topologies import layout_of
 from splatpipe.shared.build import BuildSettings, build_scene
 from splatpipe.shared.config import PipelineSection, load_config
-from splatpipe.shared.errors import MessageError
+from splatpipe.shared.errors import InputError, MessageError
 from splatpipe.shared.octree_parts import balanced_borders
 from splatpipe.shared.synth import CityScan
+from splatpipe.shared.synth.hot_octant import HotOctant
 from splatpipe.shared.windows import Window, tiles
 
 WIDTH, HEIGHT = 320, 180
@@ -257,12 +261,13 @@ def test_a_change_that_does_not_keep_its_promise_is_not_tried_again_soon():
     for i in range(300):
         hysteresis.measured(uneven)
         if hysteresis.is_uneven and hysteresis.accepts(
-            uneven, promised, slowest_s=2, adopting_s=1, frames_left=300 - i
+            uneven, promised, slowest_s=2, adopting_s=1, frames_held=1, frames_left=300 - i
         ):
             tried.append(i)
     assert tried[:8] == [0, 1, 2, 3, 4, 8, 24, 88]
-    assert not Hysteresis().accepts(uneven, promised, slowest_s=2, adopting_s=10, frames_left=20), "it would not pay"
-    assert not Hysteresis().accepts(uneven, promised, slowest_s=20, adopting_s=0, frames_left=20), "others are slower"
+    assert not Hysteresis().accepts(uneven, promised, slowest_s=2, adopting_s=10, frames_held=9, frames_left=20)
+    assert Hysteresis().accepts(uneven, promised, slowest_s=2, adopting_s=40, frames_held=90, frames_left=200)
+    assert not Hysteresis().accepts(uneven, promised, slowest_s=20, adopting_s=0, frames_held=9, frames_left=20)
 
 
 @pytest.mark.parametrize(
@@ -320,6 +325,37 @@ def test_times_survive_their_note():
 def test_times_that_are_none_are_refused(note):
     with pytest.raises(MessageError, match="STAGE_TIMES from rank 3"):
         StageTimes.from_note(note, 3)
+
+
+# --- the benchmark -----------------------------------------------------------------------------------------------
+
+
+def test_the_hot_octant_has_its_share_whatever_the_batches():
+    source = HotOctant(150_001, share=0.8)
+    batches = list(source.batches(1000, ("rgb",)))
+    again = list(HotOctant(150_001, share=0.8).batches(70_000, ("rgb",)))
+    positions = np.concatenate([batch.positions for batch in batches])
+    assert np.array_equal(positions, np.concatenate([batch.positions for batch in again]))
+    assert np.abs(positions).max() < 1
+    assert (positions > 0).all(axis=1).mean() == pytest.approx(0.8, abs=0.01)
+    octants = np.bincount((positions > 0) @ [4, 2, 1], minlength=8)
+    assert octants[:7].max() < 1.1 * octants[:7].min()
+    with pytest.raises(InputError, match=r"share = 1\.5"):
+        HotOctant(10, share=1.5)
+
+
+@pytest.mark.mpi
+@pytest.mark.skipif(not mpi_available(), reason="mpi4py or mpiexec is missing: splatpipe[mpi]")
+def test_the_benchmark_sets_off_beside_measured(tmp_path):
+    small = {"n_points": 20_000, "share": 0.9, "points_per_cell": 1000, "width": 64, "height": 48, "frames": 12}
+    results = bench_balance("sort-first-only", 2, [], **small, repeats=1, workdir=tmp_path)
+    off, on = results["rows"]
+    assert (off["balance"], off["changes"], off["note_bytes"]) == ("off", [0], [0])
+    assert on["note_bytes"][0] > 0
+    assert all(row["imbalance"]["tiles"] >= 1 and row["slowest_ms"][0] > 0 for row in (off, on))
+    console = Console(width=150, file=io.StringIO())
+    print_balance(results, console)
+    assert "90% in one octant" in console.file.getvalue()
 
 
 # --- whole runs --------------------------------------------------------------------------------------------------

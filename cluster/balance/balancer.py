@@ -91,7 +91,12 @@ class Balancer:
             self._note_after(policy.name, parts)
             proposed, expected = policy.proposal(successor, seconds)
             if hysteresis.is_uneven and hysteresis.accepts(
-                parts, expected, slowest_s=slowest_s, adopting_s=adopting_s, frames_left=len(self._frames) - position
+                parts,
+                expected,
+                slowest_s=slowest_s,
+                adopting_s=adopting_s,
+                frames_held=position - self._since,
+                frames_left=len(self._frames) - position,
             ):
                 self._note_change(policy.name, position, parts, expected, successor, proposed)
                 successor = proposed

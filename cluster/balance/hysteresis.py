@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 HORIZON_FRAMES = 64
-"""Frames for which the work is thought to stay where it is."""
+"""Frames for which the work is thought to stay where it is, at least: else for as long as the plan has held."""
 
 
 @dataclass
@@ -65,15 +65,23 @@ class Hysteresis:
         return self._above >= self.patience
 
     def accepts(
-        self, parts: np.ndarray, expected: np.ndarray, *, slowest_s: float, adopting_s: float, frames_left: int
+        self,
+        parts: np.ndarray,
+        expected: np.ndarray,
+        *,
+        slowest_s: float,
+        adopting_s: float,
+        frames_held: int,
+        frames_left: int,
     ) -> bool:
         """Whether to change to a plan whose parts are expected to take (n,) seconds, in place of those of now.
 
         slowest_s : what the slowest of all ranks takes of a frame: what gains less than a share of that is for nothing.
         adopting_s : what a change of plan was measured to cost.
+        frames_held, frames_left : how long the plan has held, and how long the run goes on.
         """
         gain_s = float(parts.max() - expected.max())
-        frames = min(frames_left, HORIZON_FRAMES)
+        frames = min(frames_left, max(frames_held, HORIZON_FRAMES))
         accepted = gain_s > self.least_gain * slowest_s and gain_s * frames > adopting_s
         if accepted:
             self._promised, self._above = (imbalance(parts), imbalance(expected)), 0

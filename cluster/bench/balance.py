@@ -43,6 +43,7 @@ def bench_balance(
     *,
     n_points: int,
     share: float,
+    points_per_cell: int,
     width: int,
     height: int,
     frames: int,
@@ -51,13 +52,14 @@ def bench_balance(
 ) -> dict[str, Any]:
     """Alternating runs with ``pipeline.balance`` off and measured; a JSON-able dict with ``rows`` and the machine.
 
-    share : of the points that are in the hot octant.  workdir : where the scene is built, and kept for the next time.
+    share : of the points that are in the hot octant.  points_per_cell : of the scene's leaves, at most: the fewer, the
+    more is selection's work.  workdir : where the scene is built, and kept for the next time.
     Raises SplatpipeError with a run's own line if it fails, or where the topology has nothing to move.
     """
     workdir.mkdir(parents=True, exist_ok=True)
-    scene = workdir / f"hot-{n_points}-{share:g}"
+    scene = workdir / f"hot-{n_points}-{share:g}-{points_per_cell}"
     if not scene.exists():
-        build_scene([HotOctant(n_points, share)], scene, settings=BuildSettings())
+        build_scene([HotOctant(n_points, share)], scene, settings=BuildSettings(points_per_cell=points_per_cell))
     config = workdir / "balance.toml"
     config.write_text(_CONFIG.format(scene=scene.resolve(), width=width, height=height, frames=frames))
     sets = [f"pipeline.topology={topology}", f"pipeline.ranks={ranks}", *overrides]
@@ -69,6 +71,7 @@ def bench_balance(
         "benchmark": "balance",
         "n_points": n_points,
         "share": share,
+        "points_per_cell": points_per_cell,
         "width": width,
         "height": height,
         "frames": frames,
