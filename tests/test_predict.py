@@ -22,6 +22,7 @@ from splatpipe.cluster.predict.scaling import TOPOLOGIES
 from splatpipe.cluster.predict.setting import Setting
 from splatpipe.cluster.predict.whatif import Case, changed
 from splatpipe.cluster.predict.workload import COLD_POINTS, Workload, count_workload, threads_of
+from splatpipe.cluster.topologies import check_topology
 from splatpipe.shared.build import BuildSettings, build_scene
 from splatpipe.shared.config import RunConfig, load_config, parse_config
 from splatpipe.shared.errors import ConfigError, InputError
@@ -352,6 +353,15 @@ def test_calibration_never_has_the_settings_it_is_used_for():
             same = found.sampling.pixel_threshold == threshold
             assert not same or threshold == 4096.0
     assert isinstance(with_point(RunConfig(), calibration_points(RunConfig())[0]), RunConfig)
+
+
+def test_calibration_has_the_ranks_of_its_own_topologies():
+    run = parse_config({"pipeline": {"topology": "hybrid", "ranks": 5, "culling_ranks": 2, "sampling_ranks": 1}})
+    runs = [with_point(run, point) for point in calibration_points(run)]
+    assert {of.pipeline.topology for of in runs} <= {"single", "pipelined"}
+    for of in runs:
+        check_topology(of)
+        assert (of.pipeline.ranks, of.pipeline.culling_ranks) == (0, 0)
 
 
 def test_what_if_changes_one_thing(config):

@@ -32,6 +32,12 @@ THRESHOLDS_PX = (4.0, 16.0)
 """Of the calibration of a run that draws every point (threshold 0); of others half and double theirs."""
 
 
+OWN_RANKS = {"pipeline.ranks": 0} | dict.fromkeys(
+    (f"pipeline.{stage}_ranks" for stage in ("culling", "sampling", "render")), 0
+)
+"""Settings with which a topology has the ranks that it has by itself."""
+
+
 def calibration_points(run: RunConfig) -> list[Point]:
     """The settings to measure for the costs of a run.
 
@@ -52,6 +58,7 @@ def calibration_points(run: RunConfig) -> list[Point]:
     return [
         {
             "pipeline.topology": topology,
+            **OWN_RANKS,
             "render.threads": threads,
             "sampling.pixel_threshold": min(pixels, 4096.0),
             "camera.width": width,

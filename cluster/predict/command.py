@@ -18,7 +18,7 @@ from ..experiment.runner import Runner
 from ..job import Job
 from ..measured import measured_run
 from ..report import Report
-from .calibrate import all_costs, calibration_experiment, extended, measured_points
+from .calibrate import OWN_RANKS, all_costs, calibration_experiment, extended, measured_points
 from .costs import Measured
 from .forecast import Forecast
 from .machine import Machine, measured_machine
@@ -52,7 +52,8 @@ def predict_command(
     case = Case.of(job, costs, machine)
     forecasts = [("as configured", case.predict())]
     for topology, threads in LAYOUTS:
-        other = changed(case, str(config), [*overrides, f"pipeline.topology={topology}"], f"render.threads={threads}")
+        layout = [f"pipeline.topology={topology}", *(f"{key}={value}" for key, value in OWN_RANKS.items())]
+        other = changed(case, str(config), [*overrides, *layout], f"render.threads={threads}")
         forecasts.append((f"{topology}, {threads or 'all'} threads", other.predict()))
     others = {change: changed(case, str(config), overrides, change) for change in what_if}
     forecasts += [(change, other.predict()) for change, other in others.items()]

@@ -19,7 +19,7 @@ ASSUMPTIONS = (
     "Stage costs are linear in cells, entries, points and pixels; on cores that ranks share, work takes busy cores / "
     "cores times as long, and each further busy core slows the others by the fitted contention. Output is off: "
     "encoding pictures and films is not predicted. Bytes between ranks of a host travel at an assumed 10 GB/s unless "
-    "told otherwise, those between hosts at the rate of their links."
+    "told otherwise, those between hosts at the rate of their links; messages are taken to be uncoded, tiles even."
 )
 
 MOST_SHOWN = 4

@@ -151,7 +151,7 @@ class Steps:
             drawn = self._parts.of(split, n)
         begin = [_Arrival((start[rank != 0],), int(rank != 0)) for rank in lane.culling]
         culling = self._stages("culling", lane.culling, culled, begin)
-        pairs = [range(k)] * m
+        pairs = [range(j * k // m, -(-(j + 1) * k // m)) for j in range(m)]  # as far as they have subtrees in common
         bits = [of.load.visibility_bytes for of in culled]
         arrived = self._send(lane.culling, culling, bits, lane.sampling, pairs, [max(bits)] * m)
         sampling = self._stages(
