@@ -186,9 +186,10 @@ def _run_topology(job: Job, transport: Transport, show: Callable[[str, int], Non
         return result
     layout = layout_of(pipeline, transport.size)
     renders = pipeline.topology == FRAME_PARALLEL or transport.rank in layout.render
-    renders_here = transport.count_here(renders)
-    if not job.config.render.threads:
-        job.threads = max(1, job.threads // max(renders_here, 1))
+    if pipeline.topology == FRAME_PARALLEL or len(layout.render) > 1:  # not where a rank waits for the scene of another
+        renders_here = transport.count_here(renders)
+        if not job.config.render.threads:
+            job.threads = max(1, job.threads // max(renders_here, 1))
     if renders:
         job.output.mkdir(parents=True, exist_ok=True)  # on a host of its own there may be no such folder yet
     if pipeline.topology == FRAME_PARALLEL:

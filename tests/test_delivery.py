@@ -204,7 +204,7 @@ def test_every_form_of_positions_is_drawn_the_same(scenes, tmp_path, name, setti
 
     def drawn(job: Job) -> np.ndarray:
         with job.open_render(lambda *_: None) as render:
-            return np.array(render.draw(camera, chosen, []).rgba)
+            return np.array(render.compose(camera, render.rasterize(camera, chosen)).rgba)
 
     with served(by_files.scene, by_files.colour) as link:
         elsewhere = parse_config(settings | {"scene": {"path": "not/here"}})
