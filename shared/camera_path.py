@@ -87,7 +87,7 @@ def camera_path(settings: CameraSection, scene: SceneInfo, n_frames: int) -> Cam
     lower, upper = np.array(scene.lower), np.array(scene.upper)
     up = up_vector(scene) if settings.up == "scene" else axis_vector(settings.up)
     fov_rad = math.radians(settings.fov_deg)
-    scene_radius = float(np.linalg.norm(upper - lower)) / 2 or 1.0
+    scene_radius = math.dist(lower, upper) / 2 or 1.0  # scaled: the squares of a tiny extent are 0
     match settings.path:
         case "orbit":
             center = (lower + upper) / 2 if settings.center is None else np.array(settings.center)
