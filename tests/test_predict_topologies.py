@@ -220,6 +220,12 @@ def parts(config):
     return CountedParts(job, count_workload(job))
 
 
+def test_counting_writes_nothing(config, tmp_path):
+    job = Job(load_config(config, [f"output.directory={tmp_path}/film", "output.mp4=true", "output.depth=true"]))
+    assert len(CountedParts(job, count_workload(job)).of("shares", 2)) == 2
+    assert not (tmp_path / "film").exists()
+
+
 @pytest.mark.parametrize("kind", ["tiles", "shares", "subtrees"])
 def test_parts_hold_everything_and_shares_nothing_twice(parts, kind):
     whole = parts.whole

@@ -192,7 +192,7 @@ class CountedParts:
         """(number of the sampled frame, of the share, words) that each share of the points leaves; None: all points."""
         job = self._job
         culling, sampling = job.culling_node(self._octree), job.sampling_node(self._octree)
-        with job.open_render(lambda *_: None) as render:
+        with job.open_render(lambda *_: None, shown=False) as render:
             for f, frame in enumerate(self._frames.tolist()):
                 camera = job.camera(frame)
                 entries = sampling.process(camera, culling.process(camera)).entries
