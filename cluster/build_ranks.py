@@ -21,7 +21,7 @@ from ..shared.errors import InputError, SplatpipeError
 from ..shared.messages import Kind
 from ..shared.readers.described import DescribedSource, described
 from ..shared.readers.source import Source
-from .launch import check_started, launch, mpi_available, record, say_failed
+from .launch import check_started, fail_all, launch, mpi_available, record, say_failed, show_traceback
 from .progress import FrameProgress
 
 if TYPE_CHECKING:
@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 
 _NOTE_EVERY_S = 0.25
 """How often a rank says how far it is, and asks whether another has failed."""
-_MPIEXEC_ENDS_US_S = 2.0
-"""How long a rank whose MPI call failed keeps quiet: a rank that died is to be named, not the one that noticed."""
 
 
 def start_ranks(n_ranks: int) -> int:
@@ -90,17 +88,12 @@ def build_on_ranks(
         transport.meet()
     except SplatpipeError as error:
         if not isinstance(error, FailedElsewhere):
-            _show_traceback(error)
+            show_traceback(error)
             say_failed(_named(transport.rank, str(error)), error.exit_status)
         transport.meet()  # so that the line is out before a rank ends
         return error.exit_status
     except BaseException as error:  # the others do not know
-        _show_traceback(error)
-        if transport.failed(error):
-            time.sleep(_MPIEXEC_ENDS_US_S)
-        say_failed(_named(transport.rank, f"{type(error).__name__}: {error}"), 1)
-        time.sleep(0.2)  # so that the line is relayed before mpiexec tears everything down
-        transport.abort(1)
+        fail_all(transport, _named(transport.rank, f"{type(error).__name__}: {error}"), 1, error)
     return 0
 
 
@@ -127,13 +120,6 @@ def _open_together(
 
 def _named(rank: int, why: str) -> str:
     return f"rank {rank}: {why}" if rank else why
-
-
-def _show_traceback(error: BaseException) -> None:
-    if "SPLATPIPE_DEBUG" in os.environ:
-        import traceback
-
-        traceback.print_exception(error)
 
 
 class MpiRanks:

@@ -16,6 +16,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -26,6 +27,8 @@ from ..shared.errors import DeviceError, InputError, SplatpipeError
 from .watch import MPIEXEC_ENDS_S, RANK_VARIABLES, TAG, Watch, die_with_parent, end_all
 
 RECORD = "@splatpipe "
+MPIEXEC_ENDS_US_S = 2.0
+"""How long a rank whose MPI call failed keeps quiet: a rank that died is to be named, not the one that noticed."""
 EXPECTED_RANKS = "SPLATPIPE_RANKS"
 _WORLD_VARIABLES = ("PMI_RANK", "PMIX_RANK", "OMPI_COMM_WORLD_RANK", "MPI_LOCALRANKID")
 _TASKS_OF_STEP = "SLURM_STEP_NUM_TASKS"
@@ -94,6 +97,24 @@ def say_failed(message: str, status: int) -> None:
         record(failed=status, why=line)
     else:
         print(line, file=sys.stderr, flush=True)
+
+
+def fail_all(transport: Any, message: str, status: int, error: BaseException) -> None:
+    """Say in one line why this rank fails, and end every rank."""
+    show_traceback(error)
+    if transport.failed(error):
+        time.sleep(MPIEXEC_ENDS_US_S)  # if a rank has died, mpiexec ends this one meanwhile, and the launcher says who
+    say_failed(message, status)
+    time.sleep(0.2)  # so that the line is relayed before mpiexec tears everything down
+    transport.abort(status)
+
+
+def show_traceback(error: BaseException) -> None:
+    """On standard error, with ``--debug``."""
+    if "SPLATPIPE_DEBUG" in os.environ:
+        import traceback
+
+        traceback.print_exception(error)
 
 
 def launch(

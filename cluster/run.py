@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import time
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -18,7 +17,17 @@ from ..shared.config import PipelineSection, RunConfig, load_config
 from ..shared.errors import ConfigError, InputError, SplatpipeError
 from ..shared.files import write_json
 from .job import Job
-from .launch import EXPECTED_RANKS, check_started, inside_mpi, launch, mpi_available, record, say_failed, started_rank
+from .launch import (
+    EXPECTED_RANKS,
+    check_started,
+    fail_all,
+    inside_mpi,
+    launch,
+    mpi_available,
+    record,
+    say_failed,
+    started_rank,
+)
 from .plan.needs import left_out
 from .plan.topology import Decision, decide
 from .plan.workload import Workload
@@ -34,8 +43,6 @@ if TYPE_CHECKING:
 
 DECISION = "SPLATPIPE_DECISION"
 """Environment variable in which the launcher tells its ranks why they are."""
-MPIEXEC_ENDS_US_S = 2.0
-"""How long a rank whose MPI call failed keeps quiet: a rank that died is to be named, not the one that noticed."""
 
 
 def run_command(config_path: Path, overrides: list[str], json_path: Path | None) -> int:
@@ -213,17 +220,8 @@ def _decided(pipeline: PipelineSection, ranks: int, lost: list[dict[str, Any]]) 
 
 def _abort(transport: Any, role: str, error: BaseException) -> None:
     """Say which rank failed and why, in one line, and end every rank."""
-    if "SPLATPIPE_DEBUG" in os.environ:
-        import traceback
-
-        traceback.print_exception(error)
-    if transport.failed(error):
-        time.sleep(MPIEXEC_ENDS_US_S)  # if a rank has died, mpiexec ends this one meanwhile, and the launcher says who
     cause = str(error) if isinstance(error, SplatpipeError) else f"{type(error).__name__}: {error}"
-    status = getattr(error, "exit_status", 1)
-    say_failed(f"rank {transport.rank} ({role}): {cause}", status)
-    time.sleep(0.2)  # so that the line is relayed before mpiexec tears everything down
-    transport.abort(status)
+    fail_all(transport, f"rank {transport.rank} ({role}): {cause}", getattr(error, "exit_status", 1), error)
 
 
 def _finish(

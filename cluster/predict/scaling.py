@@ -10,9 +10,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate
+from typing import get_args
 
 import numpy as np
 
+from ...shared.config import Topology
 from ..topologies import FRAME_PARALLEL
 from .costs import Costs
 from .forecast import picture_step
@@ -24,17 +26,7 @@ from .setting import Setting
 from .steps import Steps, largest_part
 from .workload import Workload
 
-TOPOLOGIES = (
-    "single",
-    "pipelined",
-    "master-slave",
-    "hybrid",
-    "sort-first",
-    "sort-last",
-    "sort-first-only",
-    "sort-last-only",
-    FRAME_PARALLEL,
-)
+TOPOLOGIES = tuple(name for name in get_args(Topology) if name != "auto")
 IN_FLIGHT = 4
 
 
