@@ -189,21 +189,23 @@ def orbit_radius(
     fov_y_rad: float,
     aspect: float,
 ) -> float:
-    """Least distance from which the box lower…upper is in the image from every azimuth; 1 for a single point.
+    """Least distance from which the box lower…upper is in the image from every azimuth, and in front of the eye with a
+    thousandth of its depth to spare; 1 for a single point.
 
     Closed form for the cylinder that the box sweeps: over the azimuth θ and the upper and lower rim, the largest
     ``depth offset + |x| / tan(fov_x/2)`` and ``depth offset + |y| / tan(fov_y/2)``.
     """
     reach = np.maximum(upper - center, center - lower)
     half_height = float(np.abs(up) @ reach)
-    rim = math.sqrt(max(float(reach @ reach) - half_height**2, 0.0))
+    rim = math.hypot(*(reach * (1 - np.abs(up))))  # scales: the extents' squares may be 0
     tan_y = math.tan(fov_y_rad / 2)
     tan_x = tan_y * aspect
     sin_e, cos_e = abs(math.sin(elevation_rad)), math.cos(elevation_rad)
     sideways = rim * math.hypot(cos_e, 1 / tan_x) + half_height * sin_e
     above = half_height * abs(sin_e + cos_e / tan_y) + rim * abs(cos_e - sin_e / tan_y)
     below = half_height * abs(sin_e - cos_e / tan_y) + rim * abs(cos_e + sin_e / tan_y)
-    return max(sideways, above, below) or 1.0
+    in_front = (half_height * sin_e + rim * cos_e) * 1.001  # a line along the view would reach the eye
+    return max(sideways, above, below, in_front) or 1.0
 
 
 # --- explicit poses ---------------------------------------------------------------------------------------------

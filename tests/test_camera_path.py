@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from splatpipe.shared.camera_path import (
     OrbitPath,
@@ -52,6 +52,11 @@ def angle(a, b):
     return 2 * math.asin(min(1.0, np.linalg.norm(a[:3, :3] - b[:3, :3]) / math.sqrt(8)))
 
 
+def extents(least, shift):
+    """Of boxes, flat ones too, and how far from the origin they are; shorter edges would be rounded away there."""
+    return st.tuples(st.tuples(*[st.one_of(st.just(0.0), st.floats(least, 1000))] * 3), st.just(shift))
+
+
 # --- orbit
 
 
@@ -60,10 +65,12 @@ def angle(a, b):
     st.sampled_from(AXES),
     st.floats(-90, 90),
     st.sampled_from([(640, 480), (1920, 400), (300, 900)]),
-    st.tuples(*[st.floats(0, 1000)] * 3),
-    st.sampled_from([0.0, 6.4e6]),
+    st.one_of(extents(1e-300, 0.0), extents(1e-2, 6.4e6)),
 )
-def test_the_whole_scene_is_in_every_frame(up, elevation, size, extent, shift):
+@example("x", 90.0, (640, 480), ((1.0, 0.0, 0.0), 0.0))
+@example("x", -29.0, (640, 480), ((1e-306, 1e-306, 0.0), 0.0))
+def test_the_whole_scene_is_in_every_frame(up, elevation, size, placed):
+    extent, shift = placed
     lower = np.full(3, shift)
     upper = lower + extent
     section = CameraSection(up=up, elevation_deg=elevation, width=size[0], height=size[1])
