@@ -1,7 +1,7 @@
 """The hub of a live run: passes the run's pictures to all who look, and what they want to the run.
 
-It is a thread with an event loop. Ranks reach it by ZeroMQ, viewers by ZeroMQ or from a page (``sockets``, ``web``), and
-to it they are alike (``viewers``). It never waits for any of them: of what one does not take the latest remains, and
+It is a thread with an event loop. Ranks reach it by ZeroMQ, viewers by ZeroMQ or from a page (``sockets``, ``web``);
+to it viewers are alike (``viewers``). It never waits for any of them: of what one does not take the latest remains, and
 who takes nothing is dropped.
 """
 
