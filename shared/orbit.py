@@ -102,8 +102,9 @@ class Orbit:
         return replace(self, target=self.target + height * (right * pose[:3, 0] + up * pose[:3, 1]))
 
     def zoomed(self, factor: float, right: float = 0.0, up: float = 0.0) -> Orbit:
-        """``factor`` times as near, > 0, within ``NEAREST`` and ``FARTHEST``. At this place of the picture (shares of its
-        height from its middle) what lies as deep as the target stays where it is.
+        """``factor`` times as near, > 0, within ``NEAREST`` and ``FARTHEST``.
+
+        right, up : of the picture's middle, in shares of its height: there, what lies as deep as the target stays.
         """
         distance = min(max(self.distance / factor, NEAREST * self.scale), FARTHEST * self.scale)
         stays = 1 - distance / self.distance
