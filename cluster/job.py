@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from ..nodes.raster import MAX_SIDE_PX, PointSize, Rasterizer, ResidentPoints, S
 from ..nodes.raster.choose import check_style, make_rasterizer, resolve_rasterizer
 from ..nodes.raster.cpu import kernels_cached
 from ..nodes.raster.gl_context import require_gl
-from ..nodes.render import RenderNode, Wanted, load_drawn, load_points
+from ..nodes.render import RenderNode, Wanted, load_drawn, load_points, recoloured, refiltered
 from ..nodes.sampling import Pools, SamplingNode, check_point_budget
 from ..shared.camera import Camera
 from ..shared.colour import Colouring, colormap_words, parse_colour
@@ -278,6 +278,22 @@ class Job:
     def load_any(self, scene: Scene | None = None, *, verify: bool) -> ResidentPoints | ResidentGroups | PagedPoints:
         """The points of this run, or of a share of its scene, as its rasterizer takes them. Raises StoreError."""
         return self.load_paged(scene) if self.paged else self.load_drawn(scene, verify=verify)
+
+    def load_after(self, before: Job, points: Any, scene: Scene | None = None) -> Any:
+        """``load_any`` for a job of other settings, where ``before`` has loaded ``points`` of the same scene or share:
+        of those, what is still right is kept, and checksums are not compared again.
+        """
+        colours, filtered = self.colouring == before.colouring, self.point_filter == before.point_filter
+        same_form = replace(self.wanted, point_filter=before.point_filter) == before.wanted
+        same_form &= (self.paged, self.config.memory) == (before.paged, before.config.memory)
+        if same_form and colours and filtered:
+            return points
+        scene = scene or self.scene
+        kept = same_form and isinstance(points, ResidentPoints) and not self.wanted.pools
+        if not kept or (self.wanted.features and not filtered):
+            return self.load_any(scene, verify=False)
+        points = points if colours else recoloured(points, scene, self.colouring)
+        return points if filtered else refiltered(points, scene, self.point_filter)
 
     def load_paged(self, scene: Scene | None = None) -> PagedPoints:
         """The points of this run, or of a share of its scene, to be read by pages. Raises StoreError."""

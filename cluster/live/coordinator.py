@@ -62,7 +62,7 @@ class LiveCoordinator:
             "cells": info.n_cells,
             "lower": list(info.lower),
             "upper": list(info.upper),
-            "up": view.up,
+            "up": job.views.path.up.tolist(),
             "attributes": sorted(info.attributes),
             "topology": job.config.pipeline.topology,
             "rasterizer": job.rasterizer,

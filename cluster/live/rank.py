@@ -7,8 +7,6 @@ from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any
 
 from ...nodes.picture.compose import Picture
-from ...nodes.raster import ResidentPoints
-from ...nodes.render import recoloured, refiltered
 from ...shared.messages import FrameStart
 from ...shared.store import Scene
 from ..job import Job, RenderStage
@@ -73,7 +71,7 @@ class LiveRank:
     def render(self, job: Job) -> RenderStage:
         """The render stage of a job that ``changed`` gave; the one before is closed."""
         self._render_stack.close()
-        self._points = self._points_of(job)
+        self._points = job.load_after(self._job, self._points, self._share)
         return self._open(job, lambda *_: None)
 
     def show(self, start: FrameStart, picture: Picture) -> None:
@@ -86,16 +84,3 @@ class LiveRank:
         self._job = job
         opened = job.open_render(progress, self._share, shown=self._shown, points=self._points, writes=False)
         return self._render_stack.enter_context(opened)
-
-    def _points_of(self, job: Job) -> Any:
-        """The points as a job wants them, of those that there are as far as they are right."""
-        before, points = self._job, self._points
-        scene = self._share or job.scene
-        colours = job.colouring == before.colouring
-        filtered = job.point_filter == before.point_filter
-        if colours and filtered:
-            return points
-        if not isinstance(points, ResidentPoints) or job.wanted.pools or (job.wanted.features and not filtered):
-            return job.load_any(scene, verify=False)
-        points = points if colours else recoloured(points, scene, job.colouring)
-        return points if filtered else refiltered(points, scene, job.point_filter)
