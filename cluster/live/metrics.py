@@ -82,7 +82,7 @@ class Meter:
         frames = 0
         values: dict[str, float] = {}
         for stage, (n, worked_s, waited_s) in self._stages.items():
-            n_before, worked_before, waited_before = stages.get(stage, (0, 0.0, 0.0))
+            n_before, worked_before, waited_before = stages[stage]
             done = n - n_before
             frames = max(frames, done)
             if done > 0:
