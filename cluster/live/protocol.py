@@ -174,7 +174,9 @@ def said_by_viewer(header: dict[str, Any]) -> ViewerMessage:
     """What a viewer's header says. Raises MessageError in one line."""
     model = VIEWER_MESSAGES.get(header.get("kind", "")) if isinstance(header.get("kind"), str) else None
     if model is None:
-        raise MessageError(f"kind: found {str(header.get('kind'))[:40]!r}, expected one of {', '.join(VIEWER_MESSAGES)}")
+        raise MessageError(
+            f"kind: found {str(header.get('kind'))[:40]!r}, expected one of {', '.join(VIEWER_MESSAGES)}"
+        )
     try:
         return model.model_validate_json(json.dumps(header))  # JSON, so that its lists are taken as tuples
     except ValidationError as error:

@@ -1,0 +1,112 @@
+"""What the ranks of a live run measure, put together for those who look, and written down if that is wanted."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from pathlib import Path
+from typing import IO, Any
+
+from ...shared.errors import InputError
+from .protocol import to_json
+
+MAX_RECORD_BYTES = 256 << 20
+_MAX_RANKS = 4096
+_MAX_VALUES = 128
+_LATENCIES = 64
+
+
+class Gathered:
+    """The latest of each rank, with the hub as rank −1."""
+
+    def __init__(self, host: str) -> None:
+        self._host = host
+        self._ranks: dict[int, dict[str, Any]] = {}
+        self._latencies: deque[float] = deque(maxlen=_LATENCIES)
+        self._pictures = self._bytes = 0
+        self._since = time.monotonic()
+
+    def take(self, header: dict[str, Any]) -> None:
+        """What a rank measured, as it says it: numbers that are finite."""
+        rank, values = header.get("rank"), header.get("values")
+        if not isinstance(rank, int) or not isinstance(values, dict):
+            return
+        if rank not in self._ranks and len(self._ranks) >= _MAX_RANKS:
+            return
+        named = {name: header.get(name, "") for name in ("role", "host")}
+        self._ranks[rank] = {"rank": rank, **named, "values": finite(values)}
+
+    def sent(self, n_bytes: int) -> None:
+        """A picture has gone to a viewer."""
+        self._pictures += 1
+        self._bytes += n_bytes
+
+    def shown(self, latency_s: float) -> None:
+        """A picture was acknowledged this long after its camera had come."""
+        self._latencies.append(latency_s)
+
+    def message(self, run_s: float, n_viewers: int) -> dict[str, Any]:
+        """The header ``metrics``; begins to count the hub's own again."""
+        now = time.monotonic()
+        past_s = max(now - self._since, 1e-6)
+        own = {
+            "viewers": n_viewers,
+            "pictures_per_s": self._pictures / past_s,
+            "sent_bytes_per_s": self._bytes / past_s,
+        }
+        if self._latencies:
+            own["latency_ms"] = 1e3 * sum(self._latencies) / len(self._latencies)
+        self._pictures = self._bytes = 0
+        self._since = now
+        self._latencies.clear()
+        hub = {"rank": -1, "role": "hub", "host": self._host, "values": finite(own)}
+        return {"kind": "metrics", "t": round(run_s, 3), "ranks": [self._ranks[r] for r in sorted(self._ranks)] + [hub]}
+
+
+def finite(values: dict[str, Any]) -> dict[str, float]:
+    """Those of the values that are finite numbers, to five digits; at most ``_MAX_VALUES`` of them."""
+    kept: dict[str, float] = {}
+    for name, value in list(values.items())[:_MAX_VALUES]:
+        if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
+            kept[name] = value if isinstance(value, int) else float(f"{value:.5g}")
+    return kept
+
+
+class Record:
+    """A file of JSON lines; complete under its name once closed. Stops with a note at ``MAX_RECORD_BYTES``.
+
+    Raises InputError where it cannot be written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._part = path, path.with_name(path.name + ".part")
+        self._bytes = 0
+        self._file: IO[bytes] | None
+        try:
+            self._file = self._part.open("wb")
+        except OSError as error:
+            raise InputError(f"{path}: cannot write the record: {error.strerror}") from None
+
+    def write(self, header: dict[str, Any]) -> None:
+        """Add a line."""
+        if self._file is None:
+            return
+        line = to_json(header) + b"\n"
+        self._bytes += len(line)
+        if self._bytes > MAX_RECORD_BYTES:
+            line = to_json({"kind": "bye", "why": f"the record stops here, at {MAX_RECORD_BYTES >> 20} MiB"}) + b"\n"
+        try:
+            self._file.write(line)
+            self._file.flush()
+        except OSError:  # a full disk ends the record, not the run
+            self._bytes = MAX_RECORD_BYTES + 1
+        if self._bytes > MAX_RECORD_BYTES:
+            self.close()
+
+    def close(self) -> None:
+        """Give it its name."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+            self._part.replace(self._path)
