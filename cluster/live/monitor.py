@@ -6,8 +6,10 @@ What is watched is a live run (a client of its hub), a recording of one, or a ba
 from __future__ import annotations
 
 import json
+import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,23 +17,26 @@ from rich.console import Console
 from rich.live import Live
 
 from ...shared.errors import InputError, MessageError, SplatpipeError
-from .board import Board
+from .board import Board, text
 from .connection import Connection, find_connection
 from .replay import is_recording, replayed
 from .screen import line, screen
 
 REDRAW_S = 0.1
 """Shortest time between two drawings of the screen."""
-ANSWER_S = 10.0
-"""Longest wait for the welcome."""
-SILENT_S = 3.0
-"""After so long without a word a run is looked after, and after ``ANSWER_S`` it is connected to anew."""
+PATIENCE_S = 30.0
+"""Longest wait of ``--once`` for a run's first answer."""
+SILENT_S, LOST_S = 3.0, 10.0
+"""After so long without a word: a run's connection file is looked for; it is connected to anew."""
+RECONNECT_TICKS = 10
+"""Of ``REDRAW_S``, before a connection is made anew."""
 SNAPSHOT_S = 1.5
 """Longest wait for a prediction that belongs to the first measured values."""
 LONGEST_GAP_S = 5.0
 """Of a replay: a run that rested for an hour need not be watched for one."""
 
 Header = dict[str, Any]
+Messages = Generator[Header | None]
 
 
 def monitor_command(
@@ -53,21 +58,17 @@ def monitor_command(
     if target is not None and is_recording(target):
         source = Replay(target, speed or (1.0 if on_terminal else None), at, once=once)
     else:
-        source = LiveRun(target)
-    try:
+        source = LiveRun(target, PATIENCE_S if once else math.inf)
+    with suppress(KeyboardInterrupt), closing(source.messages()) as messages:  # which is how one leaves
         if as_json:
-            _print_json(source, board, once)
+            _print_json(messages, board, once=once and isinstance(source, LiveRun))
         elif once:
-            _take_snapshot(source, board)
+            _take_snapshot(messages, board, live=isinstance(source, LiveRun))
             _print_screen(console, board, source.state)
         elif on_terminal:
-            _show(source, board, console)
+            _show(source, messages, board, console)
         else:
-            _print_lines(source, board, console)
-    except KeyboardInterrupt:
-        pass  # how one leaves
-    finally:
-        source.close()
+            _print_lines(messages, board, console)
     return 0
 
 
@@ -77,57 +78,61 @@ def monitor_command(
 class LiveRun:
     """The messages of a live run, None now and then where none comes; ends with the run.
 
+    patience_s : for the first answer; a run answers once it has loaded its scene.
     state : what to say of the connection.
     Connects anew while the run's process and connection file are there.
     """
 
-    def __init__(self, path: Path | None) -> None:
-        self._path = path
+    def __init__(self, path: Path | None, patience_s: float = math.inf) -> None:
+        self._path, self._patience_s = path, patience_s
         self._connection = find_connection(path)
-        self._client: Any = None
-        self.state = "connecting"
+        self._answered = False
+        self._why = "the run has ended"
+        self.state = "waiting for the run"
 
-    def __iter__(self) -> Iterator[Header | None]:
-        from .sockets import Client
-
+    def messages(self) -> Generator[Header | None]:
+        """To be closed."""
         connection: Connection | None = self._connection
-        welcomed = False
         while connection is not None:
-            self._client = client = Client(connection, metrics=True, name="monitor")
-            heard, here = time.monotonic(), False
-            while True:
-                header = self._next(client)
-                silent_s = time.monotonic() - heard
-                if header is None:
-                    yield None
-                    if silent_s > SILENT_S and self._again(connection) is None:
-                        break
-                    if silent_s > ANSWER_S:
-                        if not (here or welcomed):
-                            raise SplatpipeError(f"{connection.address}: no answer in {ANSWER_S:g} s")
-                        break
-                    continue
-                heard = time.monotonic()
-                if header["kind"] == "bye":
-                    if not (here or welcomed):
-                        raise SplatpipeError(f"{connection.address}: {str(header.get('why'))[:200]}")
-                    break
-                if header["kind"] == "welcome":
-                    here = welcomed = True
-                    self.state = "live"
-                yield header
-            client.close()
+            yield from self._until_lost(connection)
+            if not self._answered:
+                raise SplatpipeError(f"{connection.address}: {self._why}")
             self.state = "reconnecting"
-            for _ in range(10):
+            for _ in range(RECONNECT_TICKS):
                 time.sleep(REDRAW_S)
                 yield None
             connection = self._again(connection)
-        yield {"kind": "bye", "why": "the run has ended"}
+        yield {"kind": "bye", "why": self._why}
 
-    def close(self) -> None:
-        """Say bye."""
-        if self._client is not None:
-            self._client.close()
+    def _until_lost(self, connection: Connection) -> Iterator[Header | None]:
+        """What comes over one connection. It is lost when the hub says bye, has gone, or is silent for too long."""
+        from .sockets import Client
+
+        with Client(connection, metrics=True, name="monitor") as client:
+            began = heard = looked = time.monotonic()
+            welcomed = False
+            while True:
+                header, now = self._next(client), time.monotonic()
+                if header is None:
+                    yield None
+                    if welcomed and now - heard > LOST_S:
+                        return
+                    if not welcomed and now - began > self._patience_s:
+                        self._why = f"no answer in {self._patience_s:g} s"
+                        return
+                    if now - max(heard, looked) > SILENT_S:
+                        looked = now
+                        if self._again(connection) is None:
+                            return
+                    continue
+                heard = now
+                if header["kind"] == "bye":
+                    self._why = text(str(header.get("why") or self._why))
+                    return
+                if header["kind"] == "welcome":
+                    welcomed = self._answered = True
+                    self.state = "live"
+                yield header
 
     @staticmethod
     def _next(client: Any) -> Header | None:
@@ -158,7 +163,8 @@ class Replay:
         self._path, self._speed, self._at, self._once = path, speed, at, once
         self.state = "replayed" if speed in (None, 1.0) else f"replayed ×{speed:g}"
 
-    def __iter__(self) -> Iterator[Header | None]:
+    def messages(self) -> Generator[Header | None]:
+        """To be closed."""
         shown, due = max(self._at, 0.0), time.monotonic()
         for header in replayed(self._path):
             if header["kind"] == "metrics" and "t" in header:
@@ -175,9 +181,6 @@ class Replay:
         if not self._once:
             yield {"kind": "bye", "why": "end of the recording"}
 
-    def close(self) -> None:
-        """Nothing is held."""
-
 
 # --- how they are shown ----------------------------------------------------------------------------------------------
 
@@ -190,11 +193,11 @@ def _hear(board: Board, header: Header) -> bool:
         return False
 
 
-def _show(source: LiveRun | Replay, board: Board, console: Console) -> None:
+def _show(source: LiveRun | Replay, messages: Messages, board: Board, console: Console) -> None:
     """The screen of a terminal, until the run ends; its last state stays on the terminal."""
     drawn_s = 0.0
     with Live(console=console, screen=True, auto_refresh=False) as live:
-        for header in source:
+        for header in messages:
             if header is not None:
                 _hear(board, header)
             if time.monotonic() - drawn_s >= REDRAW_S:
@@ -205,13 +208,13 @@ def _show(source: LiveRun | Replay, board: Board, console: Console) -> None:
     _print_screen(console, board, source.state)
 
 
-def _take_snapshot(source: LiveRun | Replay, board: Board) -> None:
+def _take_snapshot(messages: Messages, board: Board, *, live: bool) -> None:
     """Listen until there are measured values, and for a moment for what was predicted of them."""
     until = None
-    for header in source:
+    for header in messages:
         if header is not None:
             _hear(board, header)
-        if isinstance(source, LiveRun) and board.heard:
+        if live and board.heard:
             until = until or time.monotonic() + SNAPSHOT_S
             if time.monotonic() > until or any(of.predicted for of in board.in_order()):
                 return
@@ -221,8 +224,8 @@ def _print_screen(console: Console, board: Board, state: str) -> None:
     console.print(screen(board, console.width, state), soft_wrap=False)
 
 
-def _print_lines(source: LiveRun | Replay, board: Board, console: Console) -> None:
-    for header in source:
+def _print_lines(messages: Messages, board: Board, console: Console) -> None:
+    for header in messages:
         if header is None or not _hear(board, header):
             continue
         if header["kind"] == "metrics":
@@ -232,10 +235,10 @@ def _print_lines(source: LiveRun | Replay, board: Board, console: Console) -> No
             return
 
 
-def _print_json(source: LiveRun | Replay, board: Board, once: bool) -> None:
-    for header in source:
+def _print_json(messages: Messages, board: Board, *, once: bool) -> None:
+    for header in messages:
         if header is not None and header["kind"] in ("welcome", "metrics", "prediction", "bye"):
             print(json.dumps(header), flush=True)
             _hear(board, header)
-            if board.ended or (once and board.heard and isinstance(source, LiveRun)):
+            if board.ended or (once and board.heard):
                 return

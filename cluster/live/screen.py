@@ -86,17 +86,19 @@ def sparkline(values: Sequence[float], width: int) -> str:
 
 
 class Bar:
-    """Lengths side by side, each in its style; as wide as there is room, which ``most`` fills."""
+    """Work as blocks, then waiting as a line; as wide as there is room, which ``most`` fills."""
 
-    def __init__(self, parts: Sequence[tuple[float, str]], most: float) -> None:
-        self.parts, self.most = parts, most
+    def __init__(self, work: float, wait: float, most: float, style: str) -> None:
+        self.work, self.wait, self.most, self.style = work, wait, most, style
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """As of rich."""
         width, out = options.max_width, Text(no_wrap=True)
-        for value, style in self.parts:
-            eighths = round(8 * width * min(max(value / self.most, 0), 1)) if self.most > 0 else 0
-            out.append("█" * (eighths // 8) + _EIGHTHS[eighths % 8].strip(), style=style)
+        if self.most > 0:
+            eighths = round(8 * width * min(max(self.work / self.most, 0), 1))
+            out.append("█" * (eighths // 8) + _EIGHTHS[eighths % 8].strip(), style=self.style)
+            end = round(width * min(max((self.work + self.wait) / self.most, 0), 1))
+            out.append("─" * (end - out.cell_len), style="bright_black")
         out.truncate(width)
         yield out
 
@@ -175,7 +177,7 @@ def _stage_table(ranks: Sequence[RankState], width: int) -> Table:
             Text(amount("_ms", wait), style="dim"),
             amount("_ms", predicted) if predicted is not None else "–",
             _ratio(work, predicted),
-            Bar([(work, _style(work, predicted) or "cyan"), (wait, "bright_black")], most),
+            Bar(work, wait, most, _style(work, predicted) or "cyan"),
         )
         before = of
     return table
@@ -211,7 +213,7 @@ def _rank_table(ranks: Sequence[RankState], width: int) -> Table:
     for _, title in columns:
         table.add_column(title, justify="right", no_wrap=True)
     for of in shown:
-        values = [_cell(name, of.values[name]) if name in of.values else "" for name, _ in columns]
+        values = [_cell(name, of) for name, _ in columns]
         table.add_row(str(of.rank), Text(of.host if wide else of.role), *values)
     return table
 
@@ -274,8 +276,13 @@ def _style(measured: float, predicted: float | None) -> str:
     return "yellow" if measured < predicted * (1 - OFF) else ""
 
 
-def _cell(name: str, value: float) -> str:
-    return f"{value:.1f}" if name == "frames_per_s" else f"{value:.2f}" if name == "cpu" else amount(name, value)
+def _cell(name: str, of: RankState) -> Text:
+    """A value of a rank, in colour where bytes are other than predicted; a rate that could be reached is no such."""
+    value = of.values.get(name)
+    if value is None:
+        return Text()
+    said = f"{value:.1f}" if name == "frames_per_s" else f"{value:.2f}" if name == "cpu" else amount(name, value)
+    return Text(said, style=_style(value, of.predicted.get(name)) if "bytes" in name else "")
 
 
 def _digits(value: float) -> str:
