@@ -71,7 +71,8 @@ class Connection:
                 json.dump(asdict(self), stream)
             part.replace(path)
         except OSError as error:
-            part.unlink(missing_ok=True)
+            with suppress(OSError):  # as where there is no such folder
+                part.unlink(missing_ok=True)
             raise InputError(f"{path}: cannot write the connection file: {error.strerror}") from None
 
     @classmethod
