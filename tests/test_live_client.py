@@ -10,8 +10,8 @@ import pytest
 pytest.importorskip("zmq", reason="pyzmq is missing: splatpipe[live]")
 pytest.importorskip("aiohttp", reason="aiohttp is missing: splatpipe[live]")
 
-from live_example import JPEG, VIEW, Answers, FakeRun  # noqa: E402
-from splatpipe.cluster.live.hub import Hub  # noqa: E402
+from live_example import JPEG, VIEW, Answers, FakeRun
+from splatpipe.cluster.live.hub import Hub
 
 PAGE = Path(__file__).resolve().parents[1] / "PROTOCOL.md"
 

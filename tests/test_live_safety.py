@@ -17,13 +17,13 @@ aiohttp = pytest.importorskip("aiohttp", reason="aiohttp is missing: splatpipe[l
 
 import live_example as example
 from live_example import HELLO, JPEG, VIEW, Answers, FakeRun, Page, next_of, until
+from mangled_messages import mangled
 from splatpipe.cluster.live import programs, switchboard, viewers, web
 from splatpipe.cluster.live.connection import Connection
 from splatpipe.cluster.live.hub import Hub
 from splatpipe.cluster.live.protocol import parse_binary, to_json
 from splatpipe.cluster.live.sockets import Client, new_keys
 from splatpipe.shared.errors import MessageError
-from test_live_protocol import mangled
 
 
 @pytest.fixture
