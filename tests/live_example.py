@@ -94,6 +94,11 @@ class FakeRun:
     def all(self, kind: str) -> list[dict[str, Any]]:
         return [message.header for message in list(self.heard) if message.kind == kind]
 
+    def last(self, kind: str, name: str) -> Any:
+        """A field of the last that rank 0 was told of a kind; None: nothing yet."""
+        told = self.all(kind)
+        return told[-1][name] if told else None
+
     def _listen(self) -> None:
         while not self._stop.is_set():
             self.heard += self.coordinator.receive(0.02)

@@ -65,7 +65,9 @@ class Switchboard:
         self._ready_at = self._told_at = 0.0
         self._settings: dict[str, Any] = {}
         self._frames: OrderedDict[int, dict[str, Any]] = OrderedDict()  # frame → its "started"
-        self._early: OrderedDict[int, tuple[dict[str, Any], bytes]] = OrderedDict()  # what came before its "started"
+        self._early: OrderedDict[tuple[str, int], tuple[dict[str, Any], bytes]] = (
+            OrderedDict()
+        )  # before their "started"
         self._picture: Parcel | None = None
         self._prediction: Parcel | None = None
         self._shown = self._shown_told = -1
@@ -252,14 +254,15 @@ class Switchboard:
         self._frames[frame] = header
         while len(self._frames) > FRAMES_KNOWN:
             self._frames.popitem(last=False)
-        if frame in self._early:
-            self.from_run(*self._early.pop(frame))
+        for kind in ("picture", "screenshot"):
+            if (kind, frame) in self._early:
+                self.from_run(*self._early.pop((kind, frame)))
 
     def _started(self, header: dict[str, Any], payload: bytes) -> dict[str, Any] | None:
         """What rank 0 said of a frame; None: it comes from another rank and is still to come, and this waits for it."""
         started = self._frames.get(header["frame"])
         if started is None:
-            self._early[header["frame"]] = header, payload
+            self._early[header["kind"], header["frame"]] = header, payload
             while len(self._early) > 2:
                 self._early.popitem(last=False)
         return started

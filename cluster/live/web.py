@@ -8,10 +8,13 @@ starts: no request names a path.
 from __future__ import annotations
 
 import asyncio
+import fcntl
 import hmac
 import ipaddress
 import logging
 import socket
+import sys
+import termios
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -97,7 +100,12 @@ class _PageOutlet:
             await self._link.send_frame(parcel.text, WSMsgType.TEXT)
 
     def waiting_bytes(self) -> int:
-        return self._transport.get_write_buffer_size()
+        """Also what the kernel has, since that takes more only when a good part of it has gone."""
+        waiting = self._transport.get_write_buffer_size()
+        with suppress(OSError, ValueError):  # closed meanwhile
+            unsent = fcntl.ioctl(self._transport.get_extra_info("socket").fileno(), termios.TIOCOUTQ, bytes(4))
+            waiting += int.from_bytes(unsent, sys.byteorder)
+        return waiting
 
     def end(self, last: Parcel | None) -> None:
         if self.closing is None:
@@ -137,7 +145,7 @@ class Site:
         self._connect, self._said, self._left = connect, said, left
         self._files = page_files()
         self._names = _names_of(bind)
-        self._since: dict[Any, float] = {}  # connection → when it was accepted
+        self._since: dict[Any, float] = {}  # connection → when it was accepted, the oldest first
         self._pages: set[Any] = set()  # connections that are WebSockets
         self.port = 0
 
@@ -164,27 +172,37 @@ class Site:
         self.port = self._listener.sockets[0].getsockname()[1]
 
     def _accept(self) -> asyncio.BaseProtocol:
-        server: Any = self._runner.server
-        if len(server.connections) >= MAX_CONNECTIONS:
-            waiting = [protocol for protocol in server.connections if protocol not in self._pages]
-            if not waiting:
+        if len(self._since) >= MAX_CONNECTIONS:
+            self._forget()
+            others = [protocol for protocol in self._since if protocol not in self._pages]  # the oldest first
+            if len(self._since) >= MAX_CONNECTIONS and not (others and self._abort(others[0])):
                 return _Refused()
-            _abort(min(waiting, key=lambda protocol: self._since.get(protocol, 0.0)))
+        server: Any = self._runner.server
         protocol = server()
         self._since[protocol] = time.monotonic()
         return protocol
 
     def tick(self) -> None:
         """To be called now and then: ends connections that ask for nothing or take nothing."""
-        server: Any = self._runner.server
-        there = set(server.connections)
+        self._forget()
         now = time.monotonic()
-        self._since = {
-            protocol: since for protocol, since in self._since.items() if protocol in there or now - since < 1
-        }
-        for protocol, since in self._since.items():
+        for protocol, since in list(self._since.items()):
             if protocol not in self._pages and now - since > REQUEST_S:
-                _abort(protocol)
+                self._abort(protocol)
+
+    def _forget(self) -> None:
+        """Forget connections that have ended. One that has just been accepted has no transport either."""
+        now = time.monotonic()
+        for protocol, since in list(self._since.items()):
+            if protocol.transport is None and now - since > 1:
+                del self._since[protocol]
+
+    def _abort(self, protocol: Any) -> bool:
+        if protocol.transport is None:
+            return False
+        protocol.transport.abort()
+        del self._since[protocol]
+        return True
 
     async def close(self) -> None:
         """Stop listening, and end what is left."""
@@ -267,11 +285,6 @@ class _Refused(asyncio.Protocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         assert isinstance(transport, asyncio.Transport)
         transport.abort()
-
-
-def _abort(protocol: Any) -> None:
-    if protocol.transport is not None:
-        protocol.transport.abort()
 
 
 def _names_of(bind: str) -> set[str]:
