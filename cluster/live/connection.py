@@ -1,7 +1,7 @@
 """Where a live run is and the keys that let one in: the connection file of programs, the variables of ranks.
 
-The file is JSON: ``protocol``, ``address``, ``server_key``, ``public_key``, ``secret_key`` (CURVE, Z85), ``url`` (of the
-page, with its token) and ``pid`` of the hub. Only its owner can read it, and it goes with the run.
+The file is JSON: ``protocol``, ``address``, ``server_key``, ``public_key``, ``secret_key`` (CURVE, Z85), ``url`` (of
+the page, with its token) and ``pid`` of the hub. Only its owner can read it, and it goes with the run.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import json
 import os
 import stat
 import tempfile
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -35,11 +36,16 @@ class RunAddress:
         return {_VARIABLE + name.upper(): value for name, value in asdict(self).items()}
 
     @classmethod
-    def from_environment(cls) -> RunAddress | None:
-        """What ``to_variables`` gave; None in a run that nobody looks at."""
+    def from_variables(cls, variables: Mapping[str, str]) -> RunAddress | None:
+        """What ``to_variables`` gave, of the environment or another mapping; None in a run that nobody looks at."""
         names = [field.name for field in fields(cls)]
-        values = {name: os.environ.get(_VARIABLE + name.upper(), "") for name in names}
+        values = {name: variables.get(_VARIABLE + name.upper(), "") for name in names}
         return cls(**values) if all(values.values()) else None
+
+    @classmethod
+    def from_environment(cls) -> RunAddress | None:
+        """That of the environment."""
+        return cls.from_variables(os.environ)
 
 
 @dataclass(frozen=True)

@@ -145,8 +145,9 @@ class LiveCoordinator:
             "still": wanted.use is not Use.MOVING,
             "scale": wanted.scale,
             "viewer": wanted.viewer,
-            "waited_ms": 1e3 * (now - wanted.asked_s),
-            "begun": now,
+            "camera_at": wanted.at,
+            "asked_at": wanted.asked_s,
+            "begun_at": now,
         }
         self._link.send(said | ({"screenshot": dict(wanted.screenshot)} if wanted.screenshot else {}))
 
@@ -190,6 +191,7 @@ class LiveCoordinator:
                     said["t"],
                     said["viewer"],
                     now,
+                    said["at"],
                 ),
                 "settings": lambda: self._set(said["set"], said["viewer"], now),
                 "screenshot": lambda: self._shoot(said),

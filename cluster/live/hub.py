@@ -1,7 +1,7 @@
 """The hub of a live run: passes the run's pictures to all who look, and what they want to the run.
 
-It is a thread with an event loop. Ranks reach it by ZeroMQ, viewers by ZeroMQ or from a page (``sockets``, ``web``), and
-to it they are alike (``viewers``). It never waits for any of them: of what one does not take the latest remains, and
+It is a thread with an event loop. Ranks reach it by ZeroMQ, viewers by ZeroMQ or from a page (``sockets``, ``web``);
+to it viewers are alike (``viewers``). It never waits for any of them: of what one does not take the latest remains, and
 who takes nothing is dropped.
 """
 
@@ -161,6 +161,12 @@ class Hub:
             with suppress(RuntimeError):  # it has ended meanwhile
                 self._loop.call_soon_threadsafe(self._stop.set)
             self._thread.join()
+
+    def end_run(self) -> None:
+        """Ask the run to end after the frame it is at; from any thread."""
+        if self._loop is not None:
+            with suppress(RuntimeError):
+                self._loop.call_soon_threadsafe(self._to_coordinator, {"kind": "quit"})
 
     def _run(self) -> None:
         try:
@@ -470,7 +476,7 @@ class Hub:
         if self._camera is None:
             return
         number, moved, at = self._camera
-        header = {"view": moved.view.model_dump(), "moving": moved.moving, "t": moved.t, "viewer": number}
+        header = {"view": moved.view.model_dump(), "moving": moved.moving, "t": moved.t, "viewer": number, "at": at}
         if self._to_coordinator({"kind": "camera", **header}):
             self._camera = None
 
@@ -515,8 +521,9 @@ class Hub:
             self._wait_for_started(header, payload)
             return
         started["width"], started["height"] = header["width"], header["height"]
-        joined = {name: started.get(name) for name in ("view", "t", "viewer")}
-        self._picture = Parcel({**header, **joined}, payload)
+        joined = {name: started.get(name) for name in ("view", "t", "viewer", "still", "scale")}
+        sent = {name: header[name] for name in ("kind", "frame", "width", "height", "encoding")}
+        self._picture = Parcel({**sent, **joined, "parts_ms": _parts_ms(started, header)}, payload)
         for viewer in self._viewers.values():
             if viewer.welcomed and viewer.pictures:
                 viewer.show(self._picture)
@@ -558,7 +565,25 @@ class Hub:
         self._write(told)
 
 
+def _parts_ms(started: dict[str, Any], picture: dict[str, Any]) -> dict[str, float]:
+    """Where the time went from the camera's arrival here to that of its picture; of clocks of one host."""
+    moments = {
+        "to_run": started["asked_at"],
+        "waiting": started["begun_at"],
+        "drawing": picture["composed_at"],
+        "queued": picture["encoding_at"],
+        "encoding": picture["sent_at"],
+        "to_hub": time.monotonic(),
+    }
+    parts, before = {}, started["camera_at"]
+    for name, at in moments.items():
+        if before is not None:
+            parts[name] = round(1e3 * max(at - before, 0.0), 2)
+        before = at
+    return parts
+
+
 def _name_of(bind: str) -> str:
     """How others reach an address that is listened on."""
-    name = socket.gethostname() if bind in ("0.0.0.0", "::") else bind  # noqa: S104
+    name = socket.gethostname() if bind in ("0.0.0.0", "::") else bind
     return f"[{name}]" if ":" in name else name

@@ -61,9 +61,7 @@ class Pictures:
                 start, rgba, composed = self._waiting.popleft()
             begun = time.monotonic()
             header, data = encoded(start, rgba, self._quality)
-            done = time.monotonic()
-            header["parts_ms"] = {"queued": 1e3 * (begun - composed), "encoding": 1e3 * (done - begun)}
-            header["composed"], header["sent"] = composed, done
+            header |= {"composed_at": composed, "encoding_at": begun, "sent_at": time.monotonic()}
             while not self._link.send(header, data) and not self._closed:
                 if start.use is Use.MOVING and self._waiting:
                     break
@@ -87,4 +85,4 @@ def encoded(start: FrameStart, rgba: np.ndarray, jpeg_quality: int) -> tuple[dic
         image.save(file, "PNG", compress_level=PNG_LEVEL)
     kind = "screenshot" if start.use is Use.SCREENSHOT else "picture"
     header = {"kind": kind, "frame": start.frame, "width": width, "height": height, "encoding": encoding}
-    return header | {"still": start.use is not Use.MOVING}, file.getvalue()
+    return header, file.getvalue()

@@ -114,6 +114,8 @@ def _check(key: str, value: Any, about: Mapping[str, Any]) -> None:
     elif kind in ("choice", "colour"):
         if not isinstance(value, str) or len(value) > MAX_TEXT:
             raise ConfigError(f"{key}: found {str(value)[:MAX_TEXT]!r}, expected a name")
+        if value not in about.get("options", [value]):
+            raise ConfigError(f"{key}: found {value!r}, expected one of {', '.join(about['options'])}")
     elif not isinstance(value, list) or len(value) > 256:
         raise ConfigError(f"{key}: expected a list of at most 256")
     elif kind == "boxes" and len(value) > about["most"]:

@@ -33,7 +33,7 @@ class Wanted:
     """The next picture.
 
     size : width and height, px.  scale : of the size that was asked for.  t : the viewer's clock.
-    asked_s : when it was asked for; of a still picture, when the camera stood.
+    asked_s : when it was asked for.  at : when the hub had that from a viewer; None where nobody waits for it.
     screenshot : who asked for it: viewer, request.
     """
 
@@ -45,6 +45,7 @@ class Wanted:
     t: float
     viewer: int
     asked_s: float
+    at: float | None
     screenshot: Mapping[str, Any] | None = None
 
 
@@ -89,6 +90,7 @@ class Steering:
     _t: float = 0.0
     _viewer: int = 0
     _asked_s: float = 0.0
+    _at: float | None = None
     _moving: bool = False
     _due: Use | None = Use.STILL
     _last_s: float = -1e9
@@ -98,14 +100,14 @@ class Steering:
     def __post_init__(self) -> None:
         self.scale = Scale(self.live.least_scale)
 
-    def looked(self, view: View, moving: bool, t: float, viewer: int, now: float) -> None:
+    def looked(self, view: View, moving: bool, t: float, viewer: int, now: float, at: float | None = None) -> None:
         """The camera has moved, or come to rest."""
-        self.view, self._t, self._viewer = view, t, viewer
+        self.view, self._t, self._viewer, self._at = view, t, viewer, at
         self._ask(moving, now)
 
     def set(self, settings: dict[str, Any], size: tuple[int, int], live: LiveSection, viewer: int, now: float) -> None:
         """Settings have changed; more changes may follow at once, as of a slider."""
-        self.settings, self.size, self.live, self._viewer, self._t = settings, size, live, viewer, 0.0
+        self.settings, self.size, self.live, self._viewer, self._t, self._at = settings, size, live, viewer, 0.0, None
         self.scale.least = live.least_scale
         self._ask(True, now)
 
@@ -137,7 +139,7 @@ class Steering:
             shot = self._screenshots.popleft()
             of = {name: shot[name] for name in ("viewer", "request")}
             size = shot["width"], shot["height"]
-            return Wanted(self.view, Use.SCREENSHOT, self.settings, size, 1.0, 0.0, shot["viewer"], now, of)
+            return Wanted(self.view, Use.SCREENSHOT, self.settings, size, 1.0, 0.0, shot["viewer"], now, None, of)
         if not self.viewers or self.wait_s(now, room) > 0:
             return None
         use = self._due or Use.STILL
@@ -145,9 +147,9 @@ class Steering:
         self._due, self._last_s = None, now
         if use is Use.STILL:
             self._moving = False
-        return Wanted(
-            self.view, use, self.settings, _sized(self.size, scale), scale, self._t, self._viewer, self._asked_s
-        )
+        t, at, self._t, self._at = self._t, self._at, 0.0, None  # of one picture, not of another that follows by itself
+        size = _sized(self.size, scale)
+        return Wanted(self.view, use, self.settings, size, scale, t, self._viewer, self._asked_s, at)
 
     def wait_s(self, now: float, room: int = 3) -> float:
         """Seconds until the next picture may be begun if nobody says anything; a minute: not before somebody does."""

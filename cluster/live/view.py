@@ -108,6 +108,7 @@ def live_config(config: RunConfig) -> RunConfig:
 @contextmanager
 def _hub(config: RunConfig, listening: Listening) -> Iterator[Hub]:
     """The hub of a run, told to whoever started it."""
+    from .connection import new_connection_file
     from .hub import Hub
     from .services import RunServices
 
@@ -116,7 +117,7 @@ def _hub(config: RunConfig, listening: Listening) -> Iterator[Hub]:
         bind=listening.bind,
         port=listening.port,
         zmq_port=listening.zmq_port,
-        connection=listening.connection,
+        connection=listening.connection or new_connection_file(),
         record=listening.record,
     ) as hub:
         print(f"look at it: {hub.url}", flush=True)
@@ -186,7 +187,9 @@ def _address(job: Job, transport: Transport, listening: Listening, stack: ExitSt
         stack.enter_context(_interrupted(hub))
         address = hub.run_address
     variables = transport.gather(json.dumps(address.to_variables() if address else {}).encode())
-    return RunAddress.from_variables(json.loads(variables[0]))
+    address = RunAddress.from_variables(json.loads(variables[0]))
+    assert address
+    return address
 
 
 def _run(job: Job, transport: Transport | None, address: RunAddress) -> None:
