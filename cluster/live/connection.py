@@ -93,16 +93,24 @@ class Connection:
             raise InputError(f"{path}: protocol {content['protocol']}, expected {PROTOCOL_VERSION}")
         return cls(**{field.name: content[field.name] for field in fields(cls)})
 
+    def remove(self, path: Path) -> None:
+        """Remove what ``write`` wrote, unless it is another run's by now."""
+        with suppress(InputError, OSError):
+            if Connection.read(path) == self:
+                path.unlink()
+
     @property
     def lives(self) -> bool:
         """Whether the process of the hub is there."""
+        if self.pid <= 0:
+            return False
         try:
             os.kill(self.pid, 0)
         except (ProcessLookupError, OverflowError):
             return False
-        except PermissionError:
+        except PermissionError:  # another user's
             return True
-        return self.pid > 0
+        return True
 
 
 def runtime_directory() -> Path:
@@ -123,8 +131,13 @@ def runtime_directory() -> Path:
 
 
 def new_connection_file() -> Path:
-    """Where this process's hub keeps its connection file unless told otherwise."""
-    return runtime_directory() / f"{os.getpid()}.json"
+    """Where this process's hub keeps its connection file unless told otherwise. Removes those of killed runs."""
+    directory = runtime_directory()
+    for file in directory.glob("*.json"):
+        with suppress(InputError, OSError):
+            if not Connection.read(file).lives:
+                file.unlink()
+    return directory / f"{os.getpid()}.json"
 
 
 def find_connection(path: Path | None = None) -> Connection:
