@@ -57,14 +57,17 @@ class RunServices:
 
         Cost: at the first call, that of culling and sampling some frames.
         """
+        from ..launch import mpi_available
         from ..plan.needs import left_out
-        from ..plan.topology import decide
+        from ..plan.topology import Decision, decide
         from ..plan.workload import Workload
 
         with self._lock:
             if self._left_out is None:
-                job = self._job
-                parts = left_out(job, Workload.of_look(job), decide(job))
+                job, chain = self._job, "a live run takes three ranks where there is MPI"
+                is_chain = self._config.pipeline.topology == "auto" and mpi_available()
+                decision = Decision("pipelined", chain) if is_chain else decide(job)
+                parts = left_out(job, Workload.of_look(job), decision)
                 self._left_out = [
                     {"what": part["what"], "why": part["why"], "saves": _saves(part["gain"], part["unit"])}
                     for part in parts
