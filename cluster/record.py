@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from ..nodes.raster.paged_points import Residency
 
 RECORD_VERSION = 1
+KEPT_FRAMES = 64
+"""Frames whose times and counts a live run keeps: more than balancing looks at (``balance.times``)."""
 
 
 class StageClock:

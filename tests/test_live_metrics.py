@@ -1,13 +1,12 @@
 """What ranks say of themselves while a run goes on, and that they remember no more than they need."""
 
 import math
-import threading
 import time
 
 import numpy as np
 from splatpipe.cluster.balance.times import FRAMES_A_NOTE, TimesTeller
-from splatpipe.cluster.live.metrics import KEPT_FRAMES, Meter, Reporter
-from splatpipe.cluster.record import FrameCounts, StageClock
+from splatpipe.cluster.live.metrics import Meter
+from splatpipe.cluster.record import KEPT_FRAMES, FrameCounts, StageClock
 from splatpipe.nodes.raster.paged_points import Residency
 from splatpipe.shared.messages import RENDER_POINT, RenderPoints, VisibilityBits
 
@@ -129,28 +128,3 @@ def test_a_call_is_cheap():
     for _ in range(20):
         meter.values(queue=1)
     print(f"{(time.perf_counter() - started) / 20 * 1e3:.3f} ms")  # said, not asserted: machines differ
-
-
-def test_a_reporter_tells_of_a_run_that_rests_too_and_leaves_nothing():
-    class Link:
-        def __init__(self):
-            self.sent, self.enough = [], threading.Event()
-
-        def send(self, header):
-            self.sent.append(header)
-            if len(self.sent) == 3:
-                self.enough.set()
-            return False
-
-    link, before = Link(), threading.active_count()
-    meter = Meter([StageClock("render", 8)], FrameCounts(keep=8))
-    with Reporter(meter, link, 2, "render", "node1", lambda: {"pixels": 7}, every_s=0.01):
-        assert link.enough.wait(10)
-    assert threading.active_count() == before
-    header = link.sent[2]
-    assert {name: header[name] for name in ("kind", "rank", "role", "host")} == {
-        "kind": "metrics", "rank": 2, "role": "render", "host": "node1",
-    }  # fmt: skip
-    assert header["values"]["pixels"] == 7
-    assert header["values"]["frames_per_s"] == 0
-    assert header["t"] > link.sent[0]["t"]

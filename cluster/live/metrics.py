@@ -1,32 +1,17 @@
 """What a rank of a live run says of itself (``metrics`` in PROTOCOL.md): means over the frames since it last did.
 
-A ``Reporter`` asks its ``Meter`` twice a second, also while the run rests, and sends what it gets:
-
-    clocks = {name: StageClock(name, keep=KEPT_FRAMES) for name in STAGES}
-    counts = FrameCounts(keep=KEPT_FRAMES)
-    meter = Meter(clocks.values(), counts, transport)
-    with Reporter(meter, link, rank, role, host, lambda: {"queue": frames.queue}):
-        …
-
-Whoever would rather ask between two frames calls ``meter.values(queue=…, pixels=…)`` and sends that.
+``LiveRank`` calls ``Meter.values`` about twice a second, also while no frame is drawn.
 """
 
 from __future__ import annotations
 
 import math
 import os
-import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any, Protocol, Self
+from collections.abc import Callable, Iterable
+from typing import Protocol
 
 from ..record import FrameCounts, StageClock, resident_bytes
-
-KEPT_FRAMES = 64
-"""Frames whose times and counts a live run keeps: more than balancing looks at (``balance.times``)."""
-
-EVERY_S = 0.5
-"""Between two messages."""
 
 POINT_BYTES = 16
 """Of a point in a pool of pages that has a colour."""
@@ -48,7 +33,7 @@ class Traffic(Protocol):
 
 
 class Meter:
-    """Takes the values of one rank; called by one thread, which need not be that of the frames.
+    """Takes the values of one rank, in one thread; no thread, file or socket of its own.
 
     clocks : of the rank's stages; those that have no frame say nothing.  counts : of its frames.
     transport : None where there is one rank.  point_bytes : of a paged point.  clock : seconds, for tests.
@@ -128,49 +113,3 @@ class Meter:
         if self._transport:
             self._sent = sum(of["bytes"] for of in self._transport.traffic().values())
             self._received = sum(self._transport.received_bytes().values())
-
-
-class Link(Protocol):
-    """What a reporter needs of a ``RunLink``."""
-
-    def send(self, header: dict[str, Any]) -> bool:
-        """Send without waiting."""
-        ...
-
-
-class Reporter:
-    """Sends a rank's values to the hub again and again, from a thread of its own; context manager.
-
-    link : of this rank.  given : what only the rank knows, as of ``Meter.values``; called from the thread.
-    Messages that the hub has no room for are lost.  Cost: 0.1 ms a message.
-    """
-
-    def __init__(
-        self,
-        meter: Meter,
-        link: Link,
-        rank: int,
-        role: str,
-        host: str,
-        given: Callable[[], Mapping[str, float]] = dict,
-        *,
-        every_s: float = EVERY_S,
-    ) -> None:
-        self._meter, self._link, self._given, self._every_s = meter, link, given, every_s
-        self._head = {"kind": "metrics", "rank": rank, "role": role, "host": host}
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="metrics", daemon=True)
-
-    def _run(self) -> None:
-        begun = time.monotonic()
-        while not self._over.wait(self._every_s):
-            values = self._meter.values(**self._given())
-            self._link.send(self._head | {"t": time.monotonic() - begun, "values": values})
-
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._over.set()
-        self._thread.join()
