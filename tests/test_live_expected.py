@@ -130,6 +130,11 @@ def folder(tmp_path_factory):
     return folder
 
 
+def test_costs_of_points_that_stay_on_disk(folder):
+    paged = ["memory.residency=paged", "memory.budget=1MB", "camera.width=64", "camera.height=36"]
+    assert measure_costs(Job(load_config(folder / "run.toml", paged)), 0.1) is not None
+
+
 def test_costs_measured_here(folder, monkeypatch):
     from splatpipe.cluster.live import expected as module
 
@@ -161,14 +166,13 @@ def test_no_model_of_what_the_gpu_draws(folder, monkeypatch):
     assert measure_costs(job) is None
 
 
-def test_a_hub_is_told_what_is_expected(tmp_path, monkeypatch):
+def test_a_hub_is_told_what_is_expected(tmp_path):
     pytest.importorskip("zmq", reason="pyzmq is missing: splatpipe[live]")
     pytest.importorskip("aiohttp", reason="aiohttp is missing: splatpipe[live]")
     from splatpipe.cluster.live import predictor
     from splatpipe.cluster.live.hub import Hub
     from splatpipe.cluster.live.sockets import Client, RunLink
 
-    monkeypatch.setattr(predictor, "EVERY_S", 0.0)
     setting = on("pipelined", 3)
     values = [{"culling.work_ms": 1, "cells": 500, "frames_per_s": 20}, {"entries": 200, "points": 1e6}]
     before = threading.active_count()

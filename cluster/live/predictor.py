@@ -23,8 +23,8 @@ from .board import Board
 from .connection import RunAddress
 from .expected import LiveCosts, expected
 
-EVERY_S = 1.0
-"""Shortest time between two predictions."""
+_SHARE = 0.05
+"""Of a core that predicting may take."""
 _LISTEN_S = 0.25
 
 
@@ -32,7 +32,7 @@ class Predictor:
     """A thread that hears metrics and sends predictions; context manager, to be left before the hub.
 
     connection : file of the hub.  address : as of its ranks.  costs : None: nothing is predicted.
-    Cost: some ms of a core a second while frames are drawn.
+    Cost: some ms for each message with metrics, of many ranks at most ``_SHARE`` of a core.
     """
 
     def __init__(self, connection: Path, address: RunAddress, costs: LiveCosts | None, setting: Setting) -> None:
@@ -70,9 +70,12 @@ class Predictor:
                 counts = counts_of(board)
                 if time.monotonic() < due or counts == told:
                     continue
+                begun = time.monotonic()
                 ranks = expected(costs, self._setting, counts)
+                now = time.monotonic()
+                due = now + (now - begun) / _SHARE
                 if ranks and link.send({"kind": "prediction", "ranks": ranks}):
-                    told, due = counts, time.monotonic() + EVERY_S
+                    told = counts
 
 
 def counts_of(board: Board) -> dict[str, float]:
