@@ -3,6 +3,8 @@
 import io
 import json
 import random
+import subprocess
+import sys
 import threading
 import time
 from contextlib import contextmanager
@@ -507,3 +509,17 @@ def test_no_run_and_no_answer(tmp_path, monkeypatch):
         monkeypatch.setattr(monitor, "PATIENCE_S", 0.3)
         with pytest.raises(SplatpipeError, match=r"127.0.0.1:9: no answer in 0.3 s"):
             say(wrong, once=True)
+
+
+def test_a_recording_takes_neither_sockets_nor_compiled_kernels(tmp_path):
+    path = record(tmp_path / "run.jsonl", recorded())
+    code = f"""
+import sys
+from pathlib import Path
+from splatpipe.cluster.live.monitor import monitor_command
+monitor_command(Path({str(path)!r}), once=True)
+print({{"zmq", "aiohttp", "numba", "mpi4py", "scipy"}} & set(sys.modules))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == "set()"

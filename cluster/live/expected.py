@@ -47,6 +47,8 @@ RESIDENT = {"render.rasterizer": "cpu", "memory.residency": "mapped"}
 """Settings of what is measured: what a paged run draws costs as much, once it is there."""
 STEADY_FRAMES = 24
 """Alike, which a forecast is made of: enough for the pipeline to be full."""
+DONE_BYTES = 31
+"""Of the note that a frame is done: how long the display was busy, as JSON."""
 MESSAGES = 4
 """Of a frame on three ranks, over which the model's cost of messages is spread."""
 
@@ -173,8 +175,7 @@ def _bytes(layout: Layout, parts: EvenParts) -> dict[int, tuple[float, float]]:
     framebuffers = parts.of("shares" if layout.split == "shares" else "tiles", len(layout.render))
     for rank, part in zip(layout.render[1:], framebuffers[1:], strict=True):
         cross(rank, layout.display, HEADER.size + float(np.mean(part.filled_bytes)))
-    if layout.display in layout.workers:
-        cross(layout.display, 0, HEADER.size)
+    cross(layout.display, 0, HEADER.size + DONE_BYTES)
     return {rank: (sent[rank], received[rank]) for rank in layout.workers}
 
 
