@@ -1,8 +1,6 @@
 """What the model expects of a frame: by hand, on every topology, and from costs that were measured here."""
 
 import math
-import threading
-import time
 
 import numpy as np
 import pytest
@@ -164,42 +162,3 @@ def test_no_model_of_what_the_gpu_draws(folder, monkeypatch):
     job = Job(load_config(folder / "run.toml", ["render.rasterizer=cpu"]))
     monkeypatch.setattr(Job, "rasterizer", "gl")
     assert measure_costs(job) is None
-
-
-def test_a_hub_is_told_what_is_expected(tmp_path):
-    pytest.importorskip("zmq", reason="pyzmq is missing: splatpipe[live]")
-    pytest.importorskip("aiohttp", reason="aiohttp is missing: splatpipe[live]")
-    from splatpipe.cluster.live import predictor
-    from splatpipe.cluster.live.hub import Hub
-    from splatpipe.cluster.live.sockets import Client, RunLink
-
-    setting = on("pipelined", 3)
-    values = [{"culling.work_ms": 1, "cells": 500, "frames_per_s": 20}, {"entries": 200, "points": 1e6}]
-    before = threading.active_count()
-    with (
-        Hub(NoServices(), connection=tmp_path / "connection.json") as hub,
-        RunLink(hub.run_address, 0, "culling", "node1") as link,
-        Client(hub.connection, metrics=True) as client,
-        predictor.Predictor(hub.connection, hub.run_address, costs(), setting),
-        predictor.Predictor(hub.connection, hub.run_address, None, setting),
-    ):
-        link.send({"kind": "ready", "run": {}, "view": {}, "settings": {}, "choices": {}})
-        for rank, of in enumerate([*values, {"render.work_ms": 20, "pixels": 1e5}]):
-            link.send({"kind": "metrics", "rank": rank, "role": "", "host": "", "t": 0, "values": of})
-        told, until = None, time.monotonic() + 20
-        while (told is None or told.kind != "prediction") and time.monotonic() < until:
-            told = client.receive(0.5)
-    assert told is not None
-    assert told.header["ranks"] == expected(costs(), setting, COUNTS | {"frames_per_s": 20.0})
-    assert threading.active_count() == before
-
-
-class NoServices:
-    def pick(self, *_):
-        return {}
-
-    def path(self, *_):
-        return ""
-
-    def left_out(self):
-        return []

@@ -4,9 +4,8 @@
 calibration that ``predict`` makes of whole runs, without ranks. ``expected`` then costs nothing worth mentioning. The
 model is that of ``predict``: the ``cpu`` rasterizer, without layers.
 
-    costs = measure_costs(job)                                       # before the ranks start; None: no model
-    ranks = expected(costs, setting_of(job.config, n_ranks), counts)   # a second or so apart
-    link.send({"kind": "prediction", "ranks": ranks})
+    costs = measure_costs(job)  # best while the run rests; None: no model
+    ranks = expected(costs, setting_of(job.config, n_ranks), counts)
 """
 
 from __future__ import annotations

@@ -33,7 +33,6 @@ from ..topologies import FRAME_PARALLEL, check_world, layout_of, ranks_to_start,
 if TYPE_CHECKING:
     from ..transport import Transport
     from .hub import Hub
-    from .predictor import Predictor
     from .sockets import RunAddress
 
 
@@ -72,15 +71,14 @@ def view_command(config_path: Path, overrides: list[str], listening: Listening) 
         )
     alone = topology == "single" or (topology == "auto" and not mpi_available())
     job = Job(config)  # everything that can be wrong with the input is said here, before anything starts
-    ranks = 1 if alone else ranks_to_start(config.pipeline, topology)
-    with _hub(config, listening) as hub, _interrupted(hub), _predictor(job, hub, ranks):
+    with _hub(config, listening) as hub, _interrupted(hub):
         if alone:
             _run(job, None, hub.run_address)
             return 0
         overrides = [part for override in overrides for part in ("--set", override)]
         return launch(
             ["view", str(config_path), *overrides],
-            ranks,
+            ranks_to_start(config.pipeline, topology),
             lambda _: None,
             hub.run_address.to_variables(),
             timeout_s=config.pipeline.timeout_s,
@@ -125,14 +123,6 @@ def _hub(config: RunConfig, listening: Listening) -> Iterator[Hub]:
         print(f"look at it: {hub.url}", flush=True)
         print(f"programs connect by {hub.connection} (splatpipe monitor); Ctrl-C ends it", flush=True)
         yield hub
-
-
-def _predictor(job: Job, hub: Hub, ranks: int) -> Predictor:
-    """What tells the hub what the performance model expects; measured here, before the ranks have the cores."""
-    from .expected import measure_costs, setting_of
-    from .predictor import Predictor
-
-    return Predictor(hub.connection, hub.run_address, measure_costs(job), setting_of(job.config, ranks))
 
 
 @contextmanager
