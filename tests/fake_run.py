@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 
 LOWER = np.array([500_000.0, 5_200_000.0, 100.0])
-UPPER = LOWER + [200.0, 120.0, 40.0]
+UPPER = LOWER + np.array([200.0, 120.0, 40.0])
 DEFAULTS: dict[str, Any] = {
     "camera.width": 640,
     "camera.height": 360,
@@ -109,7 +109,12 @@ class FakeRun:
         self.link: Any = None
         self.settings = dict(DEFAULTS)
         eye = (LOWER + UPPER) / 2 + [0, -190.0, 120.0]
-        self.view = {"eye": eye.tolist(), "target": ((LOWER + UPPER) / 2).tolist(), "up": [0.0, 0.0, 1.0], "fov_deg": 45.0}
+        self.view = {
+            "eye": eye.tolist(),
+            "target": ((LOWER + UPPER) / 2).tolist(),
+            "up": [0.0, 0.0, 1.0],
+            "fov_deg": 45.0,
+        }
         self.cameras: list[dict[str, Any]] = []
         """The last cameras, as they came."""
         self.refuse = ""
@@ -127,7 +132,9 @@ class FakeRun:
         self._thread.join()
         self.link.close()
 
-    def project(self, eye: Any, target: Any, up: Any, fov_deg: float, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+    def project(
+        self, eye: Any, target: Any, up: Any, fov_deg: float, width: int, height: int
+    ) -> tuple[np.ndarray, np.ndarray]:
         """(n, 2) pixels, (n,) depths."""
         forward = np.subtract(target, eye) / np.linalg.norm(np.subtract(target, eye))
         right = np.cross(forward, up)
@@ -137,7 +144,7 @@ class FakeRun:
         focal = height / 2 / math.tan(math.radians(fov_deg) / 2)
         with np.errstate(divide="ignore", invalid="ignore"):
             places = np.column_stack([offset @ right, -(offset @ np.cross(right, forward))]) * (focal / depth)[:, None]
-        return places + [width / 2, height / 2], depth
+        return places + np.array([width / 2, height / 2]), depth
 
     def draw(self, width: int, height: int) -> Image.Image:
         """A picture of the present view and settings."""
@@ -172,7 +179,9 @@ class FakeRun:
                "up": "z", "attributes": ["rgb", "intensity", "classification"], "classes": [2, 5, 6, 9],
                "topology": "pipelined", "rasterizer": "cpu", "ranks": [{"rank": 0, "role": "render", "host": "here"}]}  # fmt: skip
         self.link.send({"kind": "ready", "run": run, "view": self.view, "settings": self.settings, "choices": CHOICES})
-        self.link.send({"kind": "prediction", "ranks": [{"rank": 0, "values": {"render.work_ms": 14.0, "sampling.work_ms": 5.0}}]})
+        self.link.send(
+            {"kind": "prediction", "ranks": [{"rank": 0, "values": {"render.work_ms": 14.0, "sampling.work_ms": 5.0}}]}
+        )
         camera: dict[str, Any] = {"moving": False, "t": 0.0, "viewer": 0}
         due, told, refine_at = True, 0.0, math.inf
         while not self._stop.is_set():
@@ -209,7 +218,14 @@ class FakeRun:
         scale = 1.0 if still or screenshot else 0.75
         about = screenshot or {"width": self.settings["camera.width"], "height": self.settings["camera.height"]}
         width, height = max(1, round(about["width"] * scale)), max(1, round(about["height"] * scale))
-        started = {"frame": frame, "view": self.view, "t": camera["t"], "still": still, "scale": scale, "viewer": camera["viewer"]}
+        started = {
+            "frame": frame,
+            "view": self.view,
+            "t": camera["t"],
+            "still": still,
+            "scale": scale,
+            "viewer": camera["viewer"],
+        }
         asked = {name: screenshot[name] for name in ("viewer", "request")} if screenshot else None
         self.link.send({"kind": "started", **started, "screenshot": asked})
         data = io.BytesIO()
@@ -221,7 +237,9 @@ class FakeRun:
 
     def _send_metrics(self, now: float) -> None:
         wave = math.sin(now / 3)
-        for rank, (role, stage, work) in enumerate([("render", "render", 16), ("culling", "culling", 2), ("sampling", "sampling", 6)]):
+        for rank, (role, stage, work) in enumerate(
+            [("render", "render", 16), ("culling", "culling", 2), ("sampling", "sampling", 6)]
+        ):
             values = {f"{stage}.work_ms": work + 2 * wave, f"{stage}.wait_ms": 18 - work + wave, "frames_per_s": 21 + 3 * wave,
                       "queue": 2, "points": 1_234_567, "sent_bytes_per_s": 3.2e6, "memory_bytes": 4.2e8, "cpu": 0.8}  # fmt: skip
             self.link.send({"kind": "metrics", "rank": rank, "role": role, "host": "here", "t": now, "values": values})
