@@ -341,7 +341,7 @@ def test_a_recorded_path_is_saved_as_toml(page, run):
 
 def test_the_monitor_shows_ranks_against_the_model_and_what_is_left_out(page, run):
     page.keyboard.press("m")
-    page.get_by_role("img", name=re.compile(r"render: work .* ms, wait .* ms, expected 14 ms")).wait_for()
+    page.get_by_role("img", name=re.compile(r"render: work .* ms, wait .* ms, expected 14.0 ms")).wait_for()
     assert page.locator(".rank").count() == 4
     page.locator("#chart-choice").select_option("2 memory_bytes")
     page.locator(".chart", has_text="memory_bytes").wait_for()

@@ -127,10 +127,13 @@ export function coordinate(value, size) {
   return Math.abs(value) >= 1e15 ? value.toExponential(6) : value.toFixed(places);
 }
 
+/** Milliseconds, so that they stay below each other while they change. */
+export const ms = (value) => `${value.toFixed(value < 10 ? 2 : value < 100 ? 1 : 0)} ms`;
+
 /** The value of a metric in the unit that the end of its name says. */
 export function metric(name, value) {
   if (!Number.isFinite(value)) return "–";
-  if (name.endsWith("_ms")) return `${digits(value)} ms`;
+  if (name.endsWith("_ms")) return ms(value);
   if (name.endsWith("bytes_per_s")) return `${short(value)}B/s`.replace(/(\d)B/, "$1 B");
   if (name.endsWith("bytes")) return `${short(value)}B`.replace(/(\d)B/, "$1 B");
   if (name.endsWith("per_s")) return `${digits(value)} /s`;

@@ -35,6 +35,7 @@ const controls = new Controls(picture, {
   changed: modeShown,
 });
 
+const root = document.documentElement;
 let run = null;
 let settings = {};
 let camera = cameras.cameraOf({ eye: [0, -1, 0], target: [0, 0, 0], up: [0, 0, 1], fov_deg: 45 }, cameras.basisOf("z"), 1);
@@ -221,6 +222,8 @@ function settingsReceived(next) {
 }
 
 function settingsShown(shown) {
+  const background = shown["render.background"]; // also beside a picture of another shape
+  if (CSS.supports("color", background)) root.style.setProperty("--backdrop", background);
   const [box] = shown["filter.boxes"] ?? [];
   overlay.set("box", box && tool === null && !$("panel").hidden ? { lines: boxLines(box.lower, box.upper), kind: "box" } : null);
 }
@@ -274,7 +277,9 @@ const tools = {
 const narrow = matchMedia("(max-width: 640px)");
 
 function setTool(name) {
-  tool = name ? tools[name] : null;
+  if (tool !== (tools[name] ?? null)) tool?.closed?.();
+  tool = tools[name] ?? null;
+  tool?.opened?.();
   for (const [key, button] of Object.entries(toolButtons)) button.setAttribute("aria-pressed", key === name);
   $("card").hidden = !tool;
   $("card-title").textContent = tool?.title ?? "";
@@ -310,12 +315,12 @@ function modeShown() {
 
 const THEMES = ["light", "dark"];
 function setTheme(theme) {
-  document.documentElement.dataset.theme = theme;
+  root.dataset.theme = theme;
   localStorage.setItem("theme", theme);
 }
 function toggleTheme() {
-  const dark = document.documentElement.dataset.theme
-    ? document.documentElement.dataset.theme === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
+  const dark = root.dataset.theme
+    ? root.dataset.theme === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
   setTheme(dark ? "light" : "dark");
 }
 
@@ -371,7 +376,6 @@ const KEYS = {
 };
 AXES.forEach((name, i) => (KEYS[i + 1] = () => axisView(name)));
 
-const root = document.documentElement;
 addEventListener("pointerdown", () => delete root.dataset.tabbed, true);
 addEventListener("keydown", (event) => {
   if (event.key === "Tab") root.dataset.tabbed = "";

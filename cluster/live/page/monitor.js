@@ -1,6 +1,6 @@
 // The monitor over the picture: where each rank's time goes, against the model, and any metric over the last minutes.
 
-import { $, digits, h, iconButton, metric, svg } from "./dom.js";
+import { $, h, iconButton, metric, ms, svg } from "./dom.js";
 
 const HISTORY_S = 120;
 const MAX_SERIES = 1024;
@@ -82,12 +82,12 @@ export class Monitor {
     const name = rank < 0 ? "hub" : `rank ${rank}`;
     const bars = times.map(({ stage, work, wait, expected }) => {
       const bar = h("span", { class: "bar", role: "img", "aria-label":
-        `${stage}: work ${digits(work ?? 0)} ms, wait ${digits(wait)} ms${expected === undefined ? "" : `, expected ${digits(expected)} ms`}` },
+        `${stage}: work ${ms(work ?? 0)}, wait ${ms(wait)}${expected === undefined ? "" : `, expected ${ms(expected)}`}` },
       h("span", { class: "work" }), h("span", { class: "wait" }), expected !== undefined && h("span", { class: "expected" }));
       bar.style.setProperty("--work", `${(100 * (work ?? 0)) / most}%`);
       bar.style.setProperty("--wait", `${(100 * wait) / most}%`);
       bar.style.setProperty("--expected", `${(100 * (expected ?? 0)) / most}%`);
-      return h("div", { class: "stage" }, h("span", {}, stage), bar, h("span", { class: "ms" }, work === undefined ? "–" : `${digits(work)} ms`));
+      return h("div", { class: "stage" }, h("span", {}, stage), bar, h("span", { class: "ms" }, work === undefined ? "–" : ms(work)));
     });
     const shown = FIGURES.filter((key) => Number.isFinite(values?.[key]));
     const figures = shown.map((key) => h("span", { class: "stat" }, h("span", { class: "unit" }, WORDS[key] ?? key.replaceAll("_", " ")), metric(key, values[key])));

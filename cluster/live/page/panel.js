@@ -169,7 +169,7 @@ function number(of) {
     want(value);
   });
   return {
-    element: row(of, slider, h("span", { class: "field" }, field, of.unit && h("span", { class: "unit" }, of.unit))),
+    element: row(of, slider, h("span", { class: "field" }, field, of.unit && h("span", { class: `unit ${of.unit.length > 2 ? "long" : ""}` }, of.unit))),
     show(value) {
       slider.value = place(value ?? least);
       slider.setAttribute("aria-valuetext", `${value} ${of.unit}`);

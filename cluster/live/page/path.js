@@ -32,6 +32,16 @@ export class PathTool {
     this.show();
   }
 
+  opened() {
+    this.open = true;
+    this.show();
+  }
+
+  closed() {
+    this.open = false;
+    this.show();
+  }
+
   toggle() {
     this.#recording = this.#recording ? null : { start: performance.now(), every_s: 0.1 };
     if (this.#recording) this.keys = [];
@@ -120,7 +130,7 @@ export class PathTool {
     this.hint.textContent = recording ? `Recording: ${keys.length} keys, ${span.toFixed(1)} s. Move the camera.`
       : keys.length ? `${keys.length} ${keys.length === 1 ? "key" : "keys"}, ${span.toFixed(1)} s`
       : "Record while you move, or add keys one by one.";
-    this.app.overlay.set("path", keys.length > 1 && !this.playing ? {
+    this.app.overlay.set("path", this.open && keys.length > 1 && !this.playing ? {
       kind: "path",
       lines: keys.slice(1).map((key, i) => [viewOf(keys[i].camera).eye, viewOf(key.camera).eye]),
     } : null);

@@ -25,6 +25,10 @@ export class PickTool {
     this.element.replaceChildren(h("p", { class: "hint" }, "Click a point to read its position and attributes."));
   }
 
+  closed() {
+    this.clear();
+  }
+
   async click(x, y) {
     const answer = await this.app.pick(x, y);
     if (answer) this.show(answer);
@@ -81,6 +85,11 @@ export class MeasureTool {
     if (!answer.found) return toast("No point there");
     if (String(answer.position) !== String(this.points.at(-1))) this.points.push(answer.position); // a double click is one
     this.show();
+  }
+
+  /** A measurement stays to be seen beside other tools; a single point is none. */
+  closed() {
+    if (this.points.length < 2) this.clear();
   }
 
   /** { legs: [{ length, delta }], sum } in world units. */
