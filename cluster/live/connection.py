@@ -1,7 +1,7 @@
 """Where a live run is and the keys that let one in: the connection file of programs, the variables of ranks.
 
-The file is JSON: ``protocol``, ``address``, ``server_key``, ``public_key``, ``secret_key`` (CURVE, Z85), ``url`` (of the
-page, with its token) and ``pid`` of the hub. Only its owner can read it, and it goes with the run.
+The file is JSON: ``protocol``, ``address``, ``server_key``, ``public_key``, ``secret_key`` (CURVE, Z85), ``url`` (of
+the page, with its token) and ``pid`` of the hub. Only its owner can read it, and it goes with the run.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import json
 import os
 import stat
 import tempfile
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -35,11 +36,16 @@ class RunAddress:
         return {_VARIABLE + name.upper(): value for name, value in asdict(self).items()}
 
     @classmethod
-    def from_environment(cls) -> RunAddress | None:
-        """What ``to_variables`` gave; None in a run that nobody looks at."""
+    def from_variables(cls, variables: Mapping[str, str]) -> RunAddress | None:
+        """What ``to_variables`` gave, of the environment or another mapping; None in a run that nobody looks at."""
         names = [field.name for field in fields(cls)]
-        values = {name: os.environ.get(_VARIABLE + name.upper(), "") for name in names}
+        values = {name: variables.get(_VARIABLE + name.upper(), "") for name in names}
         return cls(**values) if all(values.values()) else None
+
+    @classmethod
+    def from_environment(cls) -> RunAddress | None:
+        """That of the environment."""
+        return cls.from_variables(os.environ)
 
 
 @dataclass(frozen=True)
@@ -87,16 +93,24 @@ class Connection:
             raise InputError(f"{path}: protocol {content['protocol']}, expected {PROTOCOL_VERSION}")
         return cls(**{field.name: content[field.name] for field in fields(cls)})
 
+    def remove(self, path: Path) -> None:
+        """Remove what ``write`` wrote, unless it is another run's by now."""
+        with suppress(InputError, OSError):
+            if Connection.read(path) == self:
+                path.unlink()
+
     @property
     def lives(self) -> bool:
         """Whether the process of the hub is there."""
+        if self.pid <= 0:
+            return False
         try:
             os.kill(self.pid, 0)
         except (ProcessLookupError, OverflowError):
             return False
-        except PermissionError:
+        except PermissionError:  # another user's
             return True
-        return self.pid > 0
+        return True
 
 
 def runtime_directory() -> Path:
@@ -117,8 +131,13 @@ def runtime_directory() -> Path:
 
 
 def new_connection_file() -> Path:
-    """Where this process's hub keeps its connection file unless told otherwise."""
-    return runtime_directory() / f"{os.getpid()}.json"
+    """Where this process's hub keeps its connection file unless told otherwise. Removes those of killed runs."""
+    directory = runtime_directory()
+    for file in directory.glob("*.json"):
+        with suppress(InputError, OSError):
+            if not Connection.read(file).lives:
+                file.unlink()
+    return directory / f"{os.getpid()}.json"
 
 
 def find_connection(path: Path | None = None) -> Connection:

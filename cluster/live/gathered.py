@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from ...shared.errors import InputError
-from .protocol import to_json
+from .protocol import MAX_HEADER_BYTES, to_json
 
 MAX_RECORD_BYTES = 256 << 20
 _MAX_RANKS = 4096
@@ -24,7 +24,6 @@ class Gathered:
         self._host = host
         self._ranks: dict[int, dict[str, Any]] = {}
         self._latencies: deque[float] = deque(maxlen=_LATENCIES)
-        self._pictures = self._bytes = 0
         self._since = time.monotonic()
 
     def take(self, header: dict[str, Any]) -> None:
@@ -37,31 +36,29 @@ class Gathered:
         named = {name: header.get(name, "") for name in ("role", "host")}
         self._ranks[rank] = {"rank": rank, **named, "values": finite(values)}
 
-    def sent(self, n_bytes: int) -> None:
-        """A picture has gone to a viewer."""
-        self._pictures += 1
-        self._bytes += n_bytes
-
     def shown(self, latency_s: float) -> None:
         """A picture was acknowledged this long after its camera had come."""
         self._latencies.append(latency_s)
 
-    def message(self, run_s: float, n_viewers: int) -> dict[str, Any]:
-        """The header ``metrics``; begins to count the hub's own again."""
+    def message(self, run_s: float, n_viewers: int, n_pictures: int, n_bytes: int) -> dict[str, Any]:
+        """The header ``metrics``; n_pictures, n_bytes : sent since the last one. Ranks that do not fit are left out."""
         now = time.monotonic()
         past_s = max(now - self._since, 1e-6)
         own = {
             "viewers": n_viewers,
-            "pictures_per_s": self._pictures / past_s,
-            "sent_bytes_per_s": self._bytes / past_s,
+            "pictures_per_s": n_pictures / past_s,
+            "sent_bytes_per_s": n_bytes / past_s,
         }
         if self._latencies:
             own["latency_ms"] = 1e3 * sum(self._latencies) / len(self._latencies)
-        self._pictures = self._bytes = 0
         self._since = now
         self._latencies.clear()
         hub = {"rank": -1, "role": "hub", "host": self._host, "values": finite(own)}
-        return {"kind": "metrics", "t": round(run_s, 3), "ranks": [self._ranks[r] for r in sorted(self._ranks)] + [hub]}
+        ranks = [hub, *(self._ranks[rank] for rank in sorted(self._ranks))]
+        header = {"kind": "metrics", "t": round(run_s, 3), "ranks": ranks}
+        while len(to_json(header)) > MAX_HEADER_BYTES:
+            del ranks[len(ranks) * 7 // 8 :]
+        return header
 
 
 def finite(values: dict[str, Any]) -> dict[str, float]:

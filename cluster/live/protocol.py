@@ -8,6 +8,7 @@ message: the length of the header as four bytes, little-endian, header, payload.
 from __future__ import annotations
 
 import json
+import math
 import struct
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
@@ -72,7 +73,7 @@ class View(ViewerMessage):
 
 
 class CameraMoved(ViewerMessage):
-    """The latest camera wins. moving : more will follow soon. t : the viewer's clock, which the picture carries back."""
+    """The latest camera wins. moving : more follow soon. t : the viewer's clock, which comes back with the picture."""
 
     kind: Literal["camera"]
     view: View
@@ -196,14 +197,14 @@ def to_json(header: dict[str, Any]) -> bytes:
 
 
 def parse_json(data: bytes | memoryview | str) -> dict[str, Any]:
-    """A header of bytes. Raises MessageError for what is no JSON object, has no kind, or is longer or deeper than
-    allowed.
+    """A header of bytes. Raises MessageError for what is no JSON object, has no kind or numbers that no computer's
+    float or 64-bit integer holds, or is longer or deeper than allowed.
     """
     if len(data) > MAX_HEADER_BYTES:
         raise MessageError(f"header: found {len(data)} bytes, expected at most {MAX_HEADER_BYTES}")
     try:
-        text = data if isinstance(data, str) else bytes(data).decode("utf-8")
-        header = json.loads(text, parse_constant=_refuse)
+        text = data if isinstance(data, str) else bytes(data).decode()
+        header = json.loads(text, parse_constant=_refuse, parse_float=_finite, parse_int=_integer)
     except (ValueError, RecursionError):
         raise MessageError("header: expected JSON in UTF-8") from None
     if not isinstance(header, dict) or not isinstance(header.get("kind"), str):
@@ -232,6 +233,19 @@ def parse_binary(data: bytes | memoryview) -> LiveMessage:
 
 def _refuse(constant: str) -> None:
     raise ValueError(constant)
+
+
+def _finite(digits: str) -> float:
+    number = float(digits)
+    if not math.isfinite(number):
+        raise ValueError(digits)
+    return number
+
+
+def _integer(digits: str) -> int:
+    if len(digits) > 20 or not -(2**63) <= (number := int(digits)) < 2**63:
+        raise ValueError(digits)
+    return number
 
 
 def _depth(value: Any, most: int = MAX_NESTING + 1) -> int:

@@ -28,7 +28,7 @@ try:
 except ImportError as error:
     raise DeviceError(f"ZeroMQ: {error}; install splatpipe[live]") from None
 
-__all__ = ["Client", "Gone", "HubSockets", "RunAddress", "RunLink", "new_keys"]
+__all__ = ["Client", "Gone", "HubSockets", "Router", "RunAddress", "RunLink", "new_keys", "shared_frame"]
 
 _CURVE_BYTES = 64
 """By which CURVE lengthens a frame, and some."""
@@ -65,8 +65,12 @@ class RunLink:
         self._socket.setsockopt(zmq.LINGER, _RANK_LINGER_MS)
         self._socket.setsockopt(zmq.ROUTING_ID, f"rank{rank}".encode())
         self._lock = threading.Lock()
+        self._receiving = threading.Lock()
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._closed = False
+        self._something = select.poll()
+        self._something.register(self._wake, select.POLLIN)
+        self._something.register(self._socket.getsockopt(zmq.FD), select.POLLIN)
         self._socket.connect(address.address)
         self.send({"kind": "hello", "protocol": PROTOCOL_VERSION, "rank": rank, "role": role, "host": host})
 
@@ -81,7 +85,7 @@ class RunLink:
                 return False
             sent = True
             try:
-                self._socket.send_multipart(frames, zmq.NOBLOCK, copy=not isinstance(payload, bytes))
+                self._socket.send_multipart(frames, zmq.NOBLOCK)
             except zmq.Again:
                 sent = False
             if self._socket.getsockopt(zmq.EVENTS) & zmq.POLLIN:  # else the receiver would miss what came meanwhile
@@ -91,18 +95,18 @@ class RunLink:
     def receive(self, timeout_s: float) -> list[LiveMessage]:
         """All messages that wait, for which it waits that long: [] if none came. For one thread."""
         end = time.monotonic() + timeout_s
-        while True:
-            with self._lock:
-                if self._closed:
-                    return []
-                messages = self._take()
-                descriptor = self._socket.getsockopt(zmq.FD)
-            left_s = end - time.monotonic()
-            if messages or left_s <= 0:
-                return messages
-            select.select([descriptor, self._wake], [], [], left_s)
-            with suppress(BlockingIOError):
-                os.eventfd_read(self._wake)
+        with self._receiving:
+            while True:
+                with self._lock:
+                    if self._closed:
+                        return []
+                    messages = self._take()
+                left_s = end - time.monotonic()
+                if messages or left_s <= 0:
+                    return messages
+                self._something.poll(left_s * 1000)
+                with suppress(BlockingIOError):
+                    os.eventfd_read(self._wake)
 
     def _take(self) -> list[LiveMessage]:
         messages: list[LiveMessage] = []
@@ -122,9 +126,10 @@ class RunLink:
                 return
             self._closed = True
             os.eventfd_write(self._wake, 1)
+        with self._receiving:
             self._socket.close()
+            os.close(self._wake)
         self._context.term()
-        os.close(self._wake)
 
     def __enter__(self) -> Self:
         return self
@@ -223,7 +228,12 @@ def _message(frames: list[bytes]) -> LiveMessage:
 # --- the hub's end -------------------------------------------------------------------------------------------------
 
 
-class _Router:
+def shared_frame(payload: bytes) -> Any:
+    """A copy of the payload that can be sent to many without further ones, and without pyzmq's thread for such."""
+    return zmq.Frame(payload, copy=True)
+
+
+class Router:
     """A socket of the hub that knows its peers by name. For the thread of its loop."""
 
     def __init__(self, socket: zmq.asyncio.Socket) -> None:
@@ -235,9 +245,12 @@ class _Router:
         peer, *frames = await self._socket.recv_multipart()
         return peer, frames
 
-    def send(self, peer: bytes, header: bytes, payload: bytes = b"") -> bool:
-        """Send without waiting; False: too much waits for this peer. Raises Gone. Does not copy a large payload."""
-        future: Any = self._socket.send_multipart([peer, header, payload], zmq.NOBLOCK, copy=False)
+    def send(self, peer: bytes, header: bytes, payload: Any = b"") -> bool:
+        """Send without waiting; False: too much waits for this peer. Raises Gone.
+
+        payload : bytes, or what ``shared_frame`` made of them.
+        """
+        future: Any = self._socket.send_multipart([peer, header, payload], zmq.NOBLOCK)
         error = future.exception()
         if error is None:
             return True
@@ -257,7 +270,6 @@ class HubSockets:
         self, bind: str, viewer_port: int, server_keys: tuple[str, str], run_key: str, viewer_key: str
     ) -> None:
         self._context: Any = zmq.asyncio.Context()
-        self._context.setsockopt(zmq.MAX_SOCKETS, 1024)
         self._server_keys = server_keys
         self._admitted = {b"run": run_key.encode(), b"viewers": viewer_key.encode()}
         self._sockets: list[Any] = []
@@ -272,7 +284,7 @@ class HubSockets:
             raise
         self._admitting = asyncio.get_running_loop().create_task(self._admit(), name="zap")
 
-    def _bind(self, domain: bytes, host: str, port: int, max_bytes: int, waiting: int) -> _Router:
+    def _bind(self, domain: bytes, host: str, port: int, max_bytes: int, waiting: int) -> Router:
         socket = self._context.socket(zmq.ROUTER)
         self._sockets.append(socket)
         for option, value in (
@@ -298,7 +310,7 @@ class HubSockets:
             socket.bind(address)
         except zmq.ZMQError as error:
             raise InputError(f"{address}: cannot listen there: {error.strerror}") from None
-        router = _Router(socket)
+        router = Router(socket)
         router.port = int(socket.getsockopt(zmq.LAST_ENDPOINT).rstrip(b"\0").rpartition(b":")[2])
         return router
 
@@ -313,7 +325,7 @@ class HubSockets:
             status = (b"200", b"OK", b"viewer") if admitted else (b"400", b"unknown key", b"")
             await self._zap.send_multipart([version, request, *status, b""])
 
-    def serve(self, handle: Callable[[bytes, list[bytes]], None], router: _Router) -> asyncio.Task[None]:
+    def serve(self, handle: Callable[[bytes, list[bytes]], None], router: Router) -> asyncio.Task[None]:
         """Hand what comes to ``handle``, letting others have their turn now and then."""
         return asyncio.get_running_loop().create_task(_serve(handle, router))
 
@@ -326,7 +338,7 @@ class HubSockets:
         self._context.term()
 
 
-async def _serve(handle: Callable[[bytes, list[bytes]], None], router: _Router) -> None:
+async def _serve(handle: Callable[[bytes, list[bytes]], None], router: Router) -> None:
     taken = 0
     while True:
         peer, frames = await router.receive()

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import deque
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any, Protocol
 
@@ -31,6 +32,13 @@ class Parcel:
 
     def __init__(self, header: dict[str, Any], payload: bytes = b"") -> None:
         self.header, self.payload = header, payload
+        self._shared: Any = None
+
+    def shared(self, make: Callable[[bytes], Any]) -> Any:
+        """What ``make`` gave for the payload the first time: a transport's own form of it."""
+        if self._shared is None:
+            self._shared = make(self.payload)
+        return self._shared
 
     @cached_property
     def text(self) -> bytes:
@@ -44,14 +52,16 @@ class Parcel:
 
 
 class Outlet(Protocol):
-    """The transport's side of a viewer."""
+    """The transport's side of a viewer. probed : whether only sending tells that the viewer has gone."""
+
+    probed: bool
 
     async def send(self, parcel: Parcel) -> None:
         """Send; returns when the transport has taken it. Raises ConnectionError when the viewer has gone."""
         ...
 
     def waiting_bytes(self) -> int:
-        """What the transport still has of it; changes while the viewer takes something."""
+        """What the transport still has of it; falls while the viewer takes something."""
         ...
 
     def end(self, last: Parcel | None) -> None:
@@ -105,6 +115,7 @@ class Viewer:
         self._under_way: deque[int] = deque()
         self._sending_since: float | None = None
         self._waiting_bytes = 0
+        self._sent_pictures = self._sent_bytes = 0
         self._wake = asyncio.Event()
         self._pump = asyncio.get_running_loop().create_task(self._send_all(), name=f"viewer {number}")
         self.gone = False
@@ -148,14 +159,20 @@ class Viewer:
             self._latest.pop("metrics", None)
             self._latest.pop("prediction", None)
 
+    def take_sent(self) -> tuple[int, int]:
+        """How many pictures, and bytes of payloads, have been sent since it was asked last."""
+        sent = self._sent_pictures, self._sent_bytes
+        self._sent_pictures = self._sent_bytes = 0
+        return sent
+
     def stalled(self, now: float) -> bool:
         """Whether it has taken nothing for ``PATIENCE_S`` while something waited for it."""
         waiting = self.outlet.waiting_bytes()
-        if waiting != self._waiting_bytes:  # slow is not stalled
-            self._waiting_bytes = waiting
+        if waiting < self._waiting_bytes:  # slow is not stalled
             self._picture_since = now
             if self._sending_since is not None:
                 self._sending_since = now
+        self._waiting_bytes = waiting
         since = [self._picture_since] if self._picture is not None else []
         since += [self._sending_since] if self._sending_since is not None else []
         return bool(since) and now - min(since) > PATIENCE_S
@@ -177,6 +194,7 @@ class Viewer:
         if self._picture is not None and len(self._under_way) < UNDER_WAY:
             picture, self._picture = self._picture, None
             self._under_way.append(picture.header["frame"])
+            self._picture_since = time.monotonic()
             return picture
         return None
 
@@ -190,5 +208,7 @@ class Viewer:
                     await self.outlet.send(parcel)
                     self._sending_since = None
                     self.sent_at = time.monotonic()
-        except ConnectionError:
+                    self._sent_pictures += parcel.header["kind"] == "picture"
+                    self._sent_bytes += len(parcel.payload)
+        except (ConnectionError, RuntimeError):  # RuntimeError: a WebSocket that has never opened
             self.gone = True  # the hub's next round takes it away

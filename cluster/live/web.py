@@ -10,11 +10,13 @@ from __future__ import annotations
 import asyncio
 import hmac
 import ipaddress
-import mimetypes
+import logging
 import socket
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from importlib import resources
+from pathlib import PurePath
 from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 
@@ -39,8 +41,26 @@ HEADERS = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cache-Control": "no-store",
 }
-_LAST_WORDS_S = 2.0
+TYPES = {
+    ".html": "text/html",
+    ".css": "text/css",
+    ".js": "text/javascript",
+    ".mjs": "text/javascript",
+    ".svg": "image/svg+xml",
+    ".png": "image/png",
+    ".ico": "image/x-icon",
+    ".json": "application/json",
+    ".webmanifest": "application/manifest+json",
+    ".woff2": "font/woff2",
+    ".wasm": "application/wasm",
+}
+MAX_CONNECTIONS = 512
+REQUEST_S = 20.0
+"""How long a connection may last that is no WebSocket."""
+_LAST_WORDS_S = 1.0
 _HEARTBEAT_S = 20.0
+
+_silent = logging.Logger("splatpipe.live.web", logging.CRITICAL + 1)  # what strangers send is nobody's concern
 
 
 class _File(NamedTuple):
@@ -49,12 +69,12 @@ class _File(NamedTuple):
 
 
 def page_files() -> dict[str, _File]:
-    """Address → file of the page, of the package's own directory ``page``."""
+    """Address → file, of the files with known suffixes in the package's own directory ``page``."""
     files: dict[str, _File] = {}
     directory = resources.files(__package__).joinpath("page")
     for file in directory.iterdir() if directory.is_dir() else ():
-        if file.is_file() and not file.name.startswith((".", "__")):
-            kind = mimetypes.guess_type(file.name)[0] or "application/octet-stream"
+        kind = TYPES.get(PurePath(file.name).suffix)
+        if kind is not None and file.is_file():
             files[f"/{file.name}"] = _File(file.read_bytes(), kind)
     if "/index.html" in files:
         files["/"] = files["/index.html"]
@@ -64,9 +84,11 @@ def page_files() -> dict[str, _File]:
 class _PageOutlet:
     """A viewer's end over a WebSocket."""
 
+    probed = False
+
     def __init__(self, link: web.WebSocketResponse, transport: asyncio.Transport) -> None:
         self._link, self._transport = link, transport
-        self._closing: asyncio.Task[None] | None = None
+        self.closing: asyncio.Task[None] | None = None
 
     async def send(self, parcel: Parcel) -> None:
         if parcel.payload:
@@ -78,8 +100,8 @@ class _PageOutlet:
         return self._transport.get_write_buffer_size()
 
     def end(self, last: Parcel | None) -> None:
-        if self._closing is None:
-            self._closing = asyncio.get_running_loop().create_task(self._close(last))
+        if self.closing is None:
+            self.closing = asyncio.get_running_loop().create_task(self._close(last))
 
     async def _close(self, last: Parcel | None) -> None:
         try:
@@ -115,27 +137,60 @@ class Site:
         self._connect, self._said, self._left = connect, said, left
         self._files = page_files()
         self._names = _names_of(bind)
+        self._since: dict[Any, float] = {}  # connection → when it was accepted
+        self._pages: set[Any] = set()  # connections that are WebSockets
         self.port = 0
 
     async def start(self, port: int) -> None:
         """Listen."""
-        app = web.Application(middlewares=[self._guard], client_max_size=1024)
+        app = web.Application(middlewares=[self._guard], client_max_size=1024, logger=_silent)
         app.router.add_get("/live", self._live)
         app.router.add_get("/{name:[^/]*}", self._file)
         self._runner = web.AppRunner(
-            app, access_log=None, handle_signals=False, shutdown_timeout=_LAST_WORDS_S + 1, keepalive_timeout=10.0
+            app,
+            access_log=None,
+            logger=_silent,
+            handle_signals=False,
+            shutdown_timeout=2 * _LAST_WORDS_S,
+            keepalive_timeout=REQUEST_S,
         )
         await self._runner.setup()
         try:
-            await web.TCPSite(self._runner, self._bind, port, backlog=256).start()
+            loop = asyncio.get_running_loop()
+            self._listener = await loop.create_server(self._accept, self._bind, port, backlog=256, reuse_address=True)
         except OSError as error:
             await self._runner.cleanup()
             raise InputError(f"{self._bind}:{port}: cannot listen there: {error.strerror or error}") from None
-        self.port = self._runner.addresses[0][1]
+        self.port = self._listener.sockets[0].getsockname()[1]
+
+    def _accept(self) -> asyncio.BaseProtocol:
+        server: Any = self._runner.server
+        if len(server.connections) >= MAX_CONNECTIONS:
+            waiting = [protocol for protocol in server.connections if protocol not in self._pages]
+            if not waiting:
+                return _Refused()
+            _abort(min(waiting, key=lambda protocol: self._since.get(protocol, 0.0)))
+        protocol = server()
+        self._since[protocol] = time.monotonic()
+        return protocol
+
+    def tick(self) -> None:
+        """To be called now and then: ends connections that ask for nothing or take nothing."""
+        server: Any = self._runner.server
+        there = set(server.connections)
+        now = time.monotonic()
+        self._since = {
+            protocol: since for protocol, since in self._since.items() if protocol in there or now - since < 1
+        }
+        for protocol, since in self._since.items():
+            if protocol not in self._pages and now - since > REQUEST_S:
+                _abort(protocol)
 
     async def close(self) -> None:
         """Stop listening, and end what is left."""
+        self._listener.close()
         await self._runner.cleanup()
+        await self._listener.wait_closed()
 
     @web.middleware
     async def _guard(self, request: web.Request, handler: Any) -> web.StreamResponse:
@@ -168,21 +223,24 @@ class Site:
         file = self._files.get(request.path)
         if file is None:
             return web.Response(status=404, text="nothing there")
-        return web.Response(body=file.content, content_type=file.type)
+        text = file.type.startswith("text/")
+        return web.Response(body=file.content, content_type=file.type, charset="utf-8" if text else None)
 
     async def _live(self, request: web.Request) -> web.StreamResponse:
         if request.headers.getall("Origin", []) != [f"http://{request.host}"]:
             return web.Response(status=403, text="of another origin")
-        if not hmac.compare_digest(request.query.get("token", "").encode(), self._token.encode()):
+        token = request.query.get("token", "").encode(errors="replace")
+        if not hmac.compare_digest(token, self._token.encode()):
             return web.Response(status=403, text="wrong token")
         link = web.WebSocketResponse(compress=False, max_msg_size=MAX_HEADER_BYTES, heartbeat=_HEARTBEAT_S)
-        if not link.can_prepare(request) or request.transport is None:
-            return web.Response(status=400, text="expected a WebSocket")
         transport: Any = request.transport
+        if not link.can_prepare(request) or transport is None:
+            return web.Response(status=400, text="expected a WebSocket")
         outlet = _PageOutlet(link, transport)
         viewer = self._connect(outlet)
         if viewer is None:
             return web.Response(status=503, text="too many viewers")
+        self._pages.add(request.protocol)
         why = ""
         try:
             await link.prepare(request)
@@ -193,16 +251,32 @@ class Site:
                 self._said(viewer, parse_json(message.data))
         except MessageError as error:
             why = str(error)
+        except ConnectionError:
+            pass
         finally:
             self._left(viewer, why)
-            if outlet._closing is not None:
-                await asyncio.shield(outlet._closing)
+            if outlet.closing is not None:
+                await asyncio.shield(outlet.closing)
+            self._pages.discard(request.protocol)
         return link
+
+
+class _Refused(asyncio.Protocol):
+    """A connection that is one too many."""
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.Transport)
+        transport.abort()
+
+
+def _abort(protocol: Any) -> None:
+    if protocol.transport is not None:
+        protocol.transport.abort()
 
 
 def _names_of(bind: str) -> set[str]:
     """The names by which a request may call this host."""
     names = {bind.lower(), "localhost"}
-    if bind in ("0.0.0.0", "::"):  # noqa: S104
+    if bind in ("0.0.0.0", "::"):
         names |= {socket.gethostname().lower(), socket.getfqdn().lower()}
     return names
