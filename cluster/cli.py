@@ -104,6 +104,36 @@ def view(
 
 
 @app.command()
+def monitor(
+    target: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[CONNECTION|FILE]",
+            help="Connection file, recording or run.json; default: this user's newest live run.",
+        ),
+    ] = None,
+    show: Annotated[
+        list[str] | None,
+        typer.Option("--show", metavar="NAME", help="Also the course of a metric: cpu, 'render.*'; may be repeated."),
+    ] = None,
+    once: Annotated[bool, typer.Option("--once", help="Print what holds now, and end.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print the messages, a line each.")] = False,
+    speed: Annotated[
+        float | None,
+        typer.Option(help="Of a replay; default: as recorded, at once where no terminal is.", min=0.01, max=1000),
+    ] = None,
+    at: Annotated[float, typer.Option(metavar="SECONDS", help="Of a replay: where to begin.", min=0)] = 0,
+) -> None:
+    """Show where a run's time goes, rank by rank, beside what the model expects: live, or of a recorded run.
+
+    Example: `splatpipe monitor --show 'render.*'`
+    """
+    from .live.monitor import monitor_command
+
+    raise typer.Exit(monitor_command(target, show or [], once=once, as_json=json, speed=speed, at=at))
+
+
+@app.command()
 def build(
     inputs: Annotated[list[str], typer.Argument(help="Files, folders or globs: LAS LAZ COPC PLY PCD XYZ CSV NPY E57.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Scene directory to make.")],

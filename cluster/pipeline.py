@@ -44,7 +44,7 @@ from .delivery import receive_scene, serve_scene
 from .drawn import STAGES, Drawn, merged, told_of
 from .job import Job, RenderStage
 from .layout import ALONE, Layout, Plan
-from .record import FrameCounts, StageClock, rank_record
+from .record import KEPT_FRAMES, FrameCounts, StageClock, rank_record
 from .selection import CullingPart, LaneCells, SamplingPart, first_plan, merged_entries, shares_of, with_borders
 from .transport import Transport
 from .wall import screen_windows, writes_screens
@@ -141,9 +141,10 @@ class FrameLoop:
         stages = layout.lanes[self._lane].stages_of(self._rank) if self._lane is not None else []
         self._culls, self._samples, self._renders = (stage in stages for stage in STAGES[:3])
         self._shows = self._rank == layout.display
-        self._clocks = {name: StageClock(name) for name in STAGES}
+        keep = KEPT_FRAMES if live else None
+        self._clocks = {name: StageClock(name, keep=keep) for name in STAGES}
         self._waits_in = self._clocks[stages[0] if stages else "culling"]
-        self._counts = FrameCounts()
+        self._counts = FrameCounts(keep=keep)
         self._numbers = count()
         self._handed: dict[tuple[Kind, int], deque[Any]] = {}  # from a stage of this rank to the next
         self._held: dict[str, Any] = {}
@@ -340,6 +341,7 @@ class FrameLoop:
         if self._lane is None:
             return
         if self._live:
+            self._live.measure(self._clocks.values(), self._counts, self._transport)
             while (frame := self._begin(next(self._numbers), frames))[0].use is not Use.END:
                 yield frame
             return

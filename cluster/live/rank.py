@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+import platform
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +13,8 @@ from ...nodes.picture.compose import Picture
 from ...shared.messages import FrameStart
 from ...shared.store import Scene
 from ..job import Job, RenderStage
+from ..record import FrameCounts, StageClock
+from .metrics import Meter
 from .pictures import Pictures
 from .settings import configured
 
@@ -19,15 +24,19 @@ if TYPE_CHECKING:
     from .coordinator import LiveCoordinator
     from .sockets import RunLink
 
+METRICS_S = 0.5
+
 
 class LiveRank:
     """What the frame loop of a live run asks of this rank; a context manager.
 
-    job : of the configuration as it was given.  link : to the hub.
+    job : of the configuration as it was given.  link : to the hub.  role : what this rank is called.
     """
 
-    def __init__(self, job: Job, link: RunLink) -> None:
+    def __init__(self, job: Job, link: RunLink, rank: int = 0, role: str = "all") -> None:
         self._given, self._job, self.link = job, job, link
+        self._named = {"rank": rank, "role": role, "host": platform.node()}
+        self._coordinator: LiveCoordinator | None = None
         self._share: Scene | None = None
         self._shown = False
         self._points: Any = None
@@ -38,13 +47,33 @@ class LiveRank:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._stage.close()
+        self._stage.close()  # of a rank that draws, closed by the frame loop already
 
     def coordinator(self, layout: Layout, transport: Transport | None, plan: Plan) -> LiveCoordinator:
         """The coordinator of this run, on rank 0."""
         from .coordinator import LiveCoordinator
 
-        return LiveCoordinator(self._given, layout, transport, plan, self.link)
+        self._coordinator = LiveCoordinator(self._given, layout, transport, plan, self.link)
+        return self._coordinator
+
+    def measure(self, clocks: Iterable[StageClock], counts: FrameCounts, transport: Transport | None) -> None:
+        """Tell the hub of times and counts from here on, twice a second, in a thread of its own: also at rest."""
+        meter = Meter(clocks, counts, transport)
+        over, begun = threading.Event(), time.monotonic()
+
+        def tell() -> None:
+            while not over.wait(METRICS_S):
+                given = {"queue": self._coordinator.queue} if self._coordinator else {}
+                if self._points is not None:
+                    given["pixels"] = self._job.views.width * self._job.views.height
+                values = meter.values(**given)
+                said = {"kind": "metrics", **self._named, "t": time.monotonic() - begun, "values": values}
+                self.link.send(said)
+
+        thread = threading.Thread(target=tell, name="metrics")
+        thread.start()
+        self._stage.callback(thread.join)
+        self._stage.callback(over.set)
 
     def changed(self, settings: Mapping[str, Any]) -> Job:
         """The job of other settings; the coordinator has seen to it that they are allowed."""

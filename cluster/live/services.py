@@ -18,6 +18,7 @@ from .views import camera_of
 if TYPE_CHECKING:
     from ..job import Job
     from ..selected import Selected
+    from .expected import LiveCosts
 
 
 class RunServices:
@@ -69,6 +70,22 @@ class RunServices:
                     for part in parts
                 ]
             return self._left_out
+
+    def expected(self, ranks: int, counts: dict[str, float]) -> list[dict[str, Any]]:
+        """What the performance model expects of a frame with these counts (``expected``).
+
+        Cost: at the first call, some seconds of measuring, while the run goes on.
+        """
+        from .expected import expected, setting_of
+
+        costs = self._costs
+        return expected(costs, setting_of(self._job.config, ranks), counts) if costs else []
+
+    @cached_property
+    def _costs(self) -> LiveCosts | None:
+        from .expected import measure_costs
+
+        return measure_costs(self._job)
 
     @cached_property
     def _job(self) -> Job:

@@ -71,6 +71,8 @@ class Switchboard:
         self._shown = self._shown_told = -1
         self._camera: dict[str, Any] | None = None
         self._n_watching = -1
+        self._predicted: dict[str, float] = {}
+        self._predicting: asyncio.Task[None] | None = None
         self._gathered = Gathered(host)
         self.unexpected: Exception | None = None
         """The first error of the hub's own that a message has brought about."""
@@ -331,6 +333,20 @@ class Switchboard:
             pictures, n_bytes = self._sent()
             n_viewers = sum(viewer.welcomed for viewer in self._viewers.values())
             self._tell(self._gathered.message(now - self._ready_at, n_viewers, pictures, n_bytes))
+            self._predict()
+
+    def _predict(self) -> None:
+        """Have it worked out, if anybody looks at it, what the model expects of frames as they are now."""
+        counts = self._gathered.counts()
+        wanted = any(viewer.welcomed and viewer.metrics for viewer in self._viewers.values())
+        if wanted and counts and counts != self._predicted and (self._predicting is None or self._predicting.done()):
+            self._predicted = counts
+            self._predicting = asyncio.get_running_loop().create_task(self._tell_prediction(counts))
+
+    async def _tell_prediction(self, counts: dict[str, float]) -> None:
+        ranks = await self._worker.expected(len((self._ready or {})["run"]["ranks"]), counts)
+        if ranks and not self._closed:
+            self._tell({"kind": "prediction", "ranks": ranks})
 
     def _look_after(self, viewer: Viewer, now: float) -> None:
         if viewer.gone:

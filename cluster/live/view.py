@@ -204,5 +204,6 @@ def _run(job: Job, transport: Transport | None, address: RunAddress) -> None:
         renders_here = transport.count_here(rank in layout.render)
         if not job.config.render.threads:
             job.threads = max(1, job.threads // max(renders_here, 1))
-    with RunLink(address, rank, layout.role_of(rank), platform.node()) as link, LiveRank(job, link) as live:
+    role = layout.role_of(rank)
+    with RunLink(address, rank, role, platform.node()) as link, LiveRank(job, link, rank, role) as live:
         FrameLoop(job, layout, transport, lambda *_: None, live=live).run()
