@@ -287,7 +287,7 @@ def test_a_screenshot_has_its_own_size_and_leaves_the_pictures_as_they_are(confi
     def script(hub):
         hub.tell(kind="viewers", pictures=1)
         hub.look(LOW)
-        _, before, after = hub.still()
+        _, _, after = hub.still()
         hub.tell(kind="screenshot", viewer=4, request=9, width=321, height=203)
         shot, _ = hub.wait(lambda m: m.kind == "screenshot")
         started, _ = hub.wait(lambda m: m.kind == "started" and m.header["frame"] == shot.header["frame"])
@@ -323,7 +323,7 @@ def test_what_cannot_be_drawn_is_refused_to_who_asked_and_changes_nothing(config
             assert "\n" not in refused.header["why"]
         _, after = hub.wait(lambda m: m.kind == "started" and m.header["view"]["eye"] == VIEW["eye"])
         hub.look(LOW)
-        started, picture, after = hub.still(after)
+        _, picture, _ = hub.still(after)
         assert np.array_equal(picture, reference(config, LOW))
 
     live(config, [], "single", 1, script)
