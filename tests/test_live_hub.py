@@ -94,9 +94,21 @@ def test_of_more_cameras_than_are_allowed_the_last_still_counts_and_of_others_no
     viewer.send(camera(5000.0))
     until(lambda: run.last("camera", "t") == 5000.0, "the last camera")
     assert len(run.all("camera")) < 1000
-    for _ in range(20):
-        viewer.send({"kind": "plan", "request": 1})
+    for _ in range(500):
+        viewer.send({"kind": "ack", "frame": 1})
     assert "messages a second" in next_of(viewer, "bye").header["why"]
+
+
+def test_who_floods_it_with_cameras_is_dropped(run, viewer, monkeypatch):
+    next_of(viewer, "welcome")
+    bye = None
+    for x in range(20_000):
+        viewer.send(camera(float(x)))
+        if x % 500 == 0 and (bye := viewer.receive(0.05)) is not None:
+            break
+    assert bye is not None
+    assert bye.kind == "bye"
+    assert "cameras a second" in bye.header["why"]
 
 
 def test_three_pictures_are_under_way_at_most_and_then_the_latest(run, viewer):
