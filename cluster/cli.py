@@ -73,6 +73,67 @@ def run(
 
 
 @app.command()
+def view(
+    config: Annotated[Path, typer.Argument(help="TOML file, as of `splatpipe run`; [live] is its own table.")],
+    sets: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a key: live.fps=20.")
+    ] = None,
+    bind: Annotated[str, typer.Option(help="Address to listen on; others than this machine's need the key, too.")] = (
+        "127.0.0.1"
+    ),
+    port: Annotated[int, typer.Option(help="Of the page; 0: any that is free.", min=0, max=65535)] = 0,
+    zmq_port: Annotated[int, typer.Option(help="For programs; 0: any that is free.", min=0, max=65535)] = 0,
+    connection: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Where to write how programs connect; default: a private folder."),
+    ] = None,
+    record: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Keep what the monitor shows, to replay: `splatpipe monitor FILE`."),
+    ] = None,
+) -> None:
+    """Show a scene in a web page, steered by whoever looks, drawn by as many ranks as the topology has.
+
+    Prints the address of the page. `mpirun -n 3 splatpipe view …` works as well; Ctrl-C ends it.
+
+    Example: `splatpipe view city.toml --set pipeline.topology=pipelined --port 8080`
+    """
+    from .live.view import Listening, view_command
+
+    raise typer.Exit(view_command(config, sets or [], Listening(bind, port, zmq_port, connection, record)))
+
+
+@app.command()
+def monitor(
+    target: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[CONNECTION|FILE]",
+            help="Connection file, recording or run.json; default: this user's newest live run.",
+        ),
+    ] = None,
+    show: Annotated[
+        list[str] | None,
+        typer.Option("--show", metavar="NAME", help="Also the course of a metric: cpu, 'render.*'; may be repeated."),
+    ] = None,
+    once: Annotated[bool, typer.Option("--once", help="Print what holds now, and end.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print the messages, a line each.")] = False,
+    speed: Annotated[
+        float | None,
+        typer.Option(help="Of a replay; default: as recorded, at once where no terminal is.", min=0.01, max=1000),
+    ] = None,
+    at: Annotated[float, typer.Option(metavar="SECONDS", help="Of a replay: where to begin.", min=0)] = 0,
+) -> None:
+    """Show where a run's time goes, rank by rank, beside what the model expects: live, or of a recorded run.
+
+    Example: `splatpipe monitor --show 'render.*'`
+    """
+    from .live.monitor import monitor_command
+
+    raise typer.Exit(monitor_command(target, show or [], once=once, as_json=json, speed=speed, at=at))
+
+
+@app.command()
 def build(
     inputs: Annotated[list[str], typer.Argument(help="Files, folders or globs: LAS LAZ COPC PLY PCD XYZ CSV NPY E57.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Scene directory to make.")],

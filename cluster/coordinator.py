@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
 
 from ..shared.messages import FrameStart, Kind
 from .job import Job
@@ -45,7 +45,7 @@ class Coordinator:
             self._issue()
         return self._starts[i]
 
-    def finished(self) -> None:
+    def finished(self, note: Mapping[str, Any]) -> None:
         """Take note that the display has finished the next frame."""
         self.latency_s.append(time.perf_counter() - self._issued_s[len(self.latency_s)])
 
@@ -80,5 +80,5 @@ class Coordinator:
     def _hear(self, progress: Progress) -> None:
         assert self._transport
         self._transport.receive_note(self._display, Kind.FRAME_DONE)
-        self.finished()
+        self.finished({})
         progress("rendering", len(self.latency_s))

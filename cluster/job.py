@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from ..nodes.raster import MAX_SIDE_PX, PointSize, Rasterizer, ResidentPoints, S
 from ..nodes.raster.choose import check_style, make_rasterizer, resolve_rasterizer
 from ..nodes.raster.cpu import kernels_cached
 from ..nodes.raster.gl_context import require_gl
-from ..nodes.render import RenderNode, Wanted, load_drawn, load_points
+from ..nodes.render import RenderNode, Wanted, load_drawn, load_points, recoloured, refiltered
 from ..nodes.sampling import Pools, SamplingNode, check_point_budget
 from ..shared.camera import Camera
 from ..shared.colour import Colouring, colormap_words, parse_colour
@@ -53,16 +53,17 @@ class Job:
     ``frames`` are those to draw, views of whole pictures, ascending: all, unless ``draw_only`` says otherwise.
 
     scene : the one to draw; default: that of ``scene.path``, or one without points where there are only layers.
+    layers : those of ``layers`` where they are open already.
     """
 
-    def __init__(self, config: RunConfig, scene: Scene | None = None) -> None:
+    def __init__(self, config: RunConfig, scene: Scene | None = None, layers: list[Layer] | None = None) -> None:
         if scene is None and not (config.scene.path or config.layers):
             raise ConfigError("scene.path: missing, expected a scene directory made by splatpipe build")
         check_topology(config)
         self.config = config
         self.threads = config.render.threads or len(os.sched_getaffinity(0))
         self.paged = config.memory.residency == "paged"
-        self.layers = self._read_layers() if config.layers else []
+        self.layers = layers or (self._read_layers() if config.layers else [])
         self.scene = scene or self._open_scene()
         info = self.scene.info
         self.n_pictures = config.output.frames
@@ -120,6 +121,10 @@ class Job:
         if self.film_afterwards and not config.output.png:
             raise ConfigError("output.resume = true: a film is then made of the PNG files, expected output.png = true")
 
+    def with_config(self, config: RunConfig) -> Job:
+        """The job of another configuration of the same scene and layers. Raises ConfigError."""
+        return Job(config, self.scene, self.layers)
+
     def draw_only(self, pictures: Sequence[int]) -> None:
         """Draw these pictures, ascending, and no others."""
         views = self.views.per_picture
@@ -169,6 +174,11 @@ class Job:
     def rasterizer(self) -> str:
         """Name of the rasterizer that draws, ``auto`` resolved."""
         return "cpu" if self.coded or self.paged else resolve_rasterizer(self.config.render.rasterizer)
+
+    @property
+    def resizes(self) -> bool:
+        """Whether pictures of another size cost no more than their framebuffers: no point is held in another form."""
+        return self.rasterizer == "cpu" and not (self.compact or self.paged or self.layers)
 
     @property
     def position_bytes(self) -> float:
@@ -270,6 +280,26 @@ class Job:
         """The points of this run, or of a share of its scene, in the form it draws them from. Raises StoreError."""
         return load_drawn(scene or self.scene, self.colouring, self.wanted, verify=verify)
 
+    def load_any(self, scene: Scene | None = None, *, verify: bool) -> ResidentPoints | ResidentGroups | PagedPoints:
+        """The points of this run, or of a share of its scene, as its rasterizer takes them. Raises StoreError."""
+        return self.load_paged(scene) if self.paged else self.load_drawn(scene, verify=verify)
+
+    def load_after(self, before: Job, points: Any, scene: Scene | None = None) -> Any:
+        """``load_any`` for a job of other settings, where ``before`` has loaded ``points`` of the same scene or share:
+        of those, what is still right is kept, and checksums are not compared again.
+        """
+        colours, filtered = self.colouring == before.colouring, self.point_filter == before.point_filter
+        same_form = replace(self.wanted, point_filter=before.point_filter) == before.wanted
+        same_form &= (self.paged, self.config.memory) == (before.paged, before.config.memory)
+        if same_form and colours and filtered:
+            return points
+        scene = scene or self.scene
+        kept = same_form and isinstance(points, ResidentPoints) and not self.wanted.pools
+        if not kept or (self.wanted.features and not filtered):
+            return self.load_any(scene, verify=False)
+        points = points if colours else recoloured(points, scene, self.colouring)
+        return points if filtered else refiltered(points, scene, self.point_filter)
+
     def load_paged(self, scene: Scene | None = None) -> PagedPoints:
         """The points of this run, or of a share of its scene, to be read by pages. Raises StoreError."""
         from ..nodes.page_reader import load_paged
@@ -301,14 +331,18 @@ class Job:
         *,
         shown: bool = True,
         screen: Screen | None = None,
+        points: ResidentPoints | ResidentGroups | PagedPoints | None = None,
+        writes: bool = True,
     ) -> Iterator[RenderStage]:
         """The render node of this run with its points loaded, its kernels compiled and its output open.
 
         scene : a share of the run's, whose points are drawn.  shown : whether pictures are made of what is drawn, and
-        layers drawn over it.  screen : of a wall, where no more is shown.
+        layers drawn over it.  screen : of a wall, where no more is shown.  points : where they are loaded already.
+        writes : whether what is shown goes to the outputs.
         """
-        progress("loading points", 0)
-        points = self.load_paged(scene) if self.paged else self.load_drawn(scene, verify=self.config.scene.verify)
+        if points is None:
+            progress("loading points", 0)
+            points = self.load_any(scene, verify=self.config.scene.verify)
         output = self.config.output
         with ExitStack() as stack:
             rasterizer = stack.enter_context(self.make_rasterizer(points))
@@ -330,6 +364,7 @@ class Job:
                 settings = replace(self.picture_settings, screen=screen.window if screen else None)
                 composer = stack.enter_context(Composer(settings))
                 composer.warm_up([self.camera(view) for view in range(self.views.per_picture)])
+            if composer and writes:
                 sink = stack.enter_context(
                     FrameSink(self.output, png=output.png, mp4=mp4, fps=output.fps, make_film=self.make_film)
                 )

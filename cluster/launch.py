@@ -99,6 +99,18 @@ def say_failed(message: str, status: int) -> None:
         print(line, file=sys.stderr, flush=True)
 
 
+def say_refused(transport: Any, statuses: Sequence[int], who: str, why: str) -> int:
+    """Of ranks of which some refuse to begin, the first says why; the exit status of all. Collective.
+
+    statuses : of every rank, 0 where it would begin.
+    """
+    first = next((rank for rank, status in enumerate(statuses) if status), 0)
+    if transport.rank == first and (first or started_rank() == 0):  # or each of many worlds of one would say it
+        say_failed(f"{who}: {why}" if first else why, statuses[first])
+    transport.meet()  # so that the line is out before a rank ends
+    return max(statuses)
+
+
 def fail_all(transport: Any, message: str, status: int, error: BaseException) -> None:
     """Say in one line why this rank fails, and end every rank."""
     show_traceback(error)

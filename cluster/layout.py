@@ -11,7 +11,7 @@ Who has which subtrees and which tile is a *plan*, which may change from one fra
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import accumulate, pairwise
 from typing import Any, Literal
 
@@ -104,16 +104,19 @@ class Plan:
 
     number : 0, 1, …  culling, sampling : by lane, borders of the parts among the lane's subtrees.
     windows : the tile of each render rank; empty where pictures are not split into tiles.
+    settings : keys of the configuration that hold in place of the run's, with their values; of a live run.
     """
 
     number: int
     culling: tuple[tuple[int, ...], ...]
     sampling: tuple[tuple[int, ...], ...]
     windows: tuple[Window, ...]
+    settings: Mapping[str, Any] = field(default_factory=dict)
 
     def to_note(self) -> dict[str, Any]:
         """JSON-able."""
-        return {"number": self.number, "culling": self.culling, "sampling": self.sampling, "windows": self.windows}
+        borders = {"culling": self.culling, "sampling": self.sampling, "windows": self.windows}
+        return {"number": self.number, **borders, "settings": dict(self.settings)}
 
     @classmethod
     def from_note(cls, note: Mapping[str, Any]) -> Plan:
@@ -123,7 +126,7 @@ class Plan:
             return tuple(tuple(map(int, lane)) for lane in note[name])
 
         windows = tuple(Window(*map(int, window)) for window in note["windows"])
-        return cls(int(note["number"]), borders("culling"), borders("sampling"), windows)
+        return cls(int(note["number"]), borders("culling"), borders("sampling"), windows, dict(note["settings"]))
 
 
 ALONE = Layout((Lane((0,), (0,), (0,)),))

@@ -3,7 +3,8 @@
 Every rank goes through the frames in order and does its stages of each; what a stage makes for another rank is sent,
 what it makes for this one is handed on. On three ranks frame *i* is drawn while *i + 1* is sampled and *i + 2* culled
 (thesis 5.2). The coordinator, rank 0, starts a frame only while fewer than ``frames_in_flight`` are unfinished, so
-nothing piles up. Each rank opens only its half of the scene: the selection ranks never load a point, the render rank
+nothing piles up. A live run has no last frame: its coordinator (``live``) says when it is over, and settings change
+with plans. Each rank opens only its half of the scene: the selection ranks never load a point, the render rank
 no octree unless it has a share of the points. Where the scene is delivered by messages, the sampling rank reads the
 render rank's half for it and sends it (``delivery``).
 """
@@ -12,13 +13,14 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any
+from dataclasses import replace
+from itertools import count
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from ..shared.camera import Camera
 from ..shared.config import RunConfig
 from ..shared.messages import (
     FRAME_START_BYTES,
@@ -27,6 +29,7 @@ from ..shared.messages import (
     Kind,
     Message,
     RenderPoints,
+    Use,
     VisibilityBits,
     decode_frame_start,
     decode_render_points,
@@ -41,14 +44,16 @@ from .delivery import receive_scene, serve_scene
 from .drawn import STAGES, Drawn, merged, told_of
 from .job import Job, RenderStage
 from .layout import ALONE, Layout, Plan
-from .record import FrameCounts, StageClock, rank_record
+from .record import KEPT_FRAMES, FrameCounts, StageClock, rank_record
 from .selection import CullingPart, LaneCells, SamplingPart, first_plan, merged_entries, shares_of, with_borders
 from .transport import Transport
 from .wall import screen_windows, writes_screens
 
 if TYPE_CHECKING:
+    from ..shared.camera import Camera
     from .balance.balancer import Balancer
     from .balance.times import StageTimes, TimesTeller
+    from .live.rank import LiveRank
 
 CULLING, SAMPLING, RENDER = range(3)
 """Ranks of a chain of three, where a scene is delivered by messages."""
@@ -90,11 +95,34 @@ def receive_job(config: RunConfig, transport: Transport) -> Job:
     return Job(config.model_copy(update=settled), scene)
 
 
+class Frames(Protocol):
+    """Starts the frames of a run and hears when they are done; ``coordinator`` or ``live.coordinator``. On rank 0.
+
+    plans : by number, those that frames were started by and that this rank has not adopted yet.
+    latency_s : of each frame that is done.
+    """
+
+    plans: dict[int, Plan]
+    latency_s: list[float]
+
+    def start(self, i: int, progress: Progress) -> FrameStart:
+        """Frame ``i`` as this rank is to do it, once it may start."""
+        ...
+
+    def finished(self, note: Mapping[str, Any]) -> None:
+        """Take note that the display has finished the next frame. note : busy_s, how long it took the display."""
+        ...
+
+    def finish(self, progress: Progress) -> None:
+        """Hear of every frame that is still to be finished."""
+        ...
+
+
 class FrameLoop:
     """One rank's way through the frames of a job.
 
     transport : None where there is one rank.  ready : called when all is loaded, before the first frame; by default
-    the ranks meet.
+    the ranks meet.  live : this rank's part of a live run, where frames come until it is over.
     """
 
     def __init__(
@@ -104,6 +132,7 @@ class FrameLoop:
         transport: Transport | None,
         progress: Progress,
         ready: Callable[[], object] | None = None,
+        live: LiveRank | None = None,
     ) -> None:
         self._job, self._layout, self._transport, self._progress = job, layout, transport, progress
         self._rank = transport.rank if transport else 0
@@ -112,43 +141,39 @@ class FrameLoop:
         stages = layout.lanes[self._lane].stages_of(self._rank) if self._lane is not None else []
         self._culls, self._samples, self._renders = (stage in stages for stage in STAGES[:3])
         self._shows = self._rank == layout.display
-        self._clocks = {name: StageClock(name) for name in STAGES}
+        keep = KEPT_FRAMES if live else None
+        self._clocks = {name: StageClock(name, keep=keep) for name in STAGES}
         self._waits_in = self._clocks[stages[0] if stages else "culling"]
-        self._counts = FrameCounts()
+        self._counts = FrameCounts(keep=keep)
+        self._numbers = count()
         self._handed: dict[tuple[Kind, int], deque[Any]] = {}  # from a stage of this rank to the next
         self._held: dict[str, Any] = {}
         self._plan = Plan(-1, (), (), ())
         self._culling: CullingPart | None = None
         self._sampling: SamplingPart | None = None
         self.adopting_s: list[float] = []
-        self._balances = is_on(job.config.pipeline, layout, bool(screen_windows(job, layout)))
+        self._live = live
+        self._render: RenderStage | None = None
+        self._balances = not live and is_on(job.config.pipeline, layout, bool(screen_windows(job, layout)))
         self.balancer: Balancer | None = None
 
     def run(self) -> Drawn:
         """Load what this rank's stages need, and do its part of every frame of the job."""
         loading = time.perf_counter()
-        job = self._job
         with ExitStack() as stack:
             self._open_selection()
-            render = self._open_render(stack)
+            self._render = self._open_render(stack)
             self._warm_up_selection()
             self._progress("loading the scene", 0)
             self._ready()
             tell = self._open_balance() if self._balances else None
             started = time.perf_counter()
-            frames = None
-            if self._rank == 0:
-                frames = Coordinator(job, self._layout, self._transport, self._plan, self.balancer)
-            coming = self._coming(frames, render)
-            for i in range(len(job.frames) if self._lane is not None else 0):
-                start, chosen, of_layers = next(coming)
-                if render and chosen:
-                    self._draw(render, start.camera, chosen, of_layers)
-                if self._shows and frames:
-                    frames.finished()
-                    self._progress("rendering", i + 1)
-                elif self._shows and self._transport:
-                    self._transport.send_note(0, Kind.FRAME_DONE, start.frame)
+            frames = self._open_frames() if self._rank == 0 else None
+            for i, (start, chosen, of_layers) in enumerate(self._coming(frames)):
+                if chosen:
+                    self._draw(start, chosen, of_layers)
+                if self._shows:
+                    self._finished(start, frames)
                 if tell:
                     tell.done(i)
             if frames:
@@ -159,14 +184,19 @@ class FrameLoop:
         return Drawn(
             [clock for clock in self._clocks.values() if clock.work_s],
             self._counts,
-            render.times() if render else {},
-            render.description if render else "",
+            self._render.times() if self._render else {},
+            self._render.description if self._render else "",
             self._held,
             frames.latency_s if frames else [],
             started - loading,
             started,
             drawn,
         )
+
+    def _open_frames(self) -> Frames:
+        if self._live:
+            return self._live.coordinator(self._layout, self._transport, self._plan)
+        return Coordinator(self._job, self._layout, self._transport, self._plan, self.balancer)
 
     # --- before the first frame --------------------------------------------------------------------------------------
 
@@ -196,9 +226,16 @@ class FrameLoop:
     def _adopt(self, plan: Plan) -> None:
         """Make this rank's parts what a plan says."""
         begun = time.process_time()
-        held, self._plan = self._plan, plan
+        held = self._plan
+        if not plan.culling:  # of a coordinator that knows no borders
+            plan = replace(plan, culling=held.culling, sampling=held.sampling)
+        self._plan = plan
+        is_changed = self._live is not None and plan.settings != held.settings
+        if self._live and is_changed:
+            self._job = self._live.changed(plan.settings)
+            self._render = self._render and self._live.render(self._job)
         if self._lane is not None and (self._culls or self._samples):
-            if (held.culling, held.sampling) != (plan.culling, plan.sampling):
+            if is_changed or (held.culling, held.sampling) != (plan.culling, plan.sampling):
                 self._make_parts(self._lane, plan)
             for part in filter(None, (self._culling, self._sampling)):
                 part.look_through(self._layout, self._lane, plan)
@@ -267,6 +304,8 @@ class FrameLoop:
         self._waits_for_screens = self._transport if screen else None
         self._meet = None if screen else self._meeting()
         shown = self._shows or screen is not None
+        if self._live:
+            return stack.enter_context(self._live.open_render(self._progress, share, shown=shown))
         return stack.enter_context(job.open_render(self._progress, share, shown=shown, screen=screen))
 
     def _meeting(self) -> Callable[[int, np.ndarray], np.ndarray | None] | None:
@@ -293,14 +332,20 @@ class FrameLoop:
 
     # --- a frame -----------------------------------------------------------------------------------------------------
 
-    def _coming(
-        self, frames: Coordinator | None, render: RenderStage | None
-    ) -> Iterator[tuple[FrameStart, RenderPoints | None, list[RenderPoints]]]:
+    def _coming(self, frames: Frames | None) -> Iterator[tuple[FrameStart, RenderPoints | None, list[RenderPoints]]]:
         """Frames in turn, selected as far as that is this rank's part: start, points and objects to draw.
 
         Where points are paged, up to ``frames_ahead`` more are selected, or received if they are there, before it is
         the turn of one, so that theirs are loaded meanwhile. None where plans change: they say how a frame is drawn.
         """
+        if self._lane is None:
+            return
+        if self._live:
+            self._live.measure(self._clocks.values(), self._counts, self._transport)
+            while (frame := self._begin(next(self._numbers), frames))[0].use is not Use.END:
+                yield frame
+            return
+        render = self._render
         n_ahead = render.frames_ahead if render and not self._balances else 0
         n_frames, begun = len(self._job.frames), 0
         ahead: deque[tuple[FrameStart, RenderPoints | None, list[RenderPoints]]] = deque()
@@ -313,7 +358,7 @@ class FrameLoop:
                 begun += 1
             yield ahead.popleft()
 
-    def _can_begin(self, frames: Coordinator | None) -> bool:
+    def _can_begin(self, frames: Frames | None) -> bool:
         """Whether to begin another frame before it is its turn: this rank selects it, or somebody has."""
         if self._culls or self._samples or self._lane is None or not self._transport:
             return True
@@ -322,10 +367,12 @@ class FrameLoop:
         )
         return bool(frames or self._transport.has_note(0, Kind.FRAME_START)) and all(sampled)
 
-    def _begin(self, i: int, frames: Coordinator | None) -> tuple[FrameStart, RenderPoints | None, list[RenderPoints]]:
+    def _begin(self, i: int, frames: Frames | None) -> tuple[FrameStart, RenderPoints | None, list[RenderPoints]]:
         """Do what comes before drawing of frame ``i``; without points for a rank that does not draw."""
         with self._waits_in.waiting():
             start = frames.start(i, self._progress) if frames else self._receive_start()
+        if start.use is Use.END:
+            return start, None, []
         self._follow(start.plan, frames)
         self._select(start.camera)
         if not self._renders:
@@ -340,9 +387,10 @@ class FrameLoop:
 
     def _receive_start(self) -> FrameStart:
         assert self._transport
-        return decode_frame_start(*self._transport.receive(0, Kind.FRAME_START, FRAME_START_BYTES))
+        patient = self._live is not None  # nobody may move the camera for hours
+        return decode_frame_start(*self._transport.receive(0, Kind.FRAME_START, FRAME_START_BYTES, patient=patient))
 
-    def _follow(self, number: int, frames: Coordinator | None) -> None:
+    def _follow(self, number: int, frames: Frames | None) -> None:
         """Adopt plans until the one of a number holds. Rank 0 may have started frames by later ones."""
         while self._plan.number < number:
             if frames:
@@ -387,9 +435,10 @@ class FrameLoop:
                 self._hand(self._layout.display, Kind.RENDER_POINTS, message)
             self._counts.add(chosen)
 
-    def _draw(self, render: RenderStage, camera: Camera, chosen: RenderPoints, of_layers: list[RenderPoints]) -> None:
+    def _draw(self, start: FrameStart, chosen: RenderPoints, of_layers: list[RenderPoints]) -> None:
         """Rasterize this rank's part, and on the display rank make the picture of all parts."""
-        clock = self._clocks["render"]
+        render, camera, clock = self._render, start.camera, self._clocks["render"]
+        assert render
         with clock.working():
             words = render.rasterize(camera, chosen)
             picture = None if self._meet else render.compose(camera, words, of_layers)
@@ -400,11 +449,23 @@ class FrameLoop:
                 with self._clocks["picture"].working():
                     picture = render.compose(camera, whole, of_layers)
         with clock.waiting():
-            render.show(camera.frame, picture)
+            if self._live and picture is not None:
+                self._live.show(start, picture)
+            else:
+                render.show(camera.frame, picture)
             if self._waits_for_screens:
                 self._meet_screens(self._waits_for_screens, camera.frame)
         self._counts.add_layers(of_layers)
         self._counts.add_residency(render.residency)
+
+    def _finished(self, start: FrameStart, frames: Frames | None) -> None:
+        """On the display rank: let the coordinator know."""
+        note = {"busy_s": sum(clock.work_s[-1] for clock in self._clocks.values() if clock.work_s)}
+        if frames:
+            frames.finished(note)
+            self._progress("rendering", len(frames.latency_s))
+        elif self._transport:
+            self._transport.send_note(0, Kind.FRAME_DONE, start.frame, note if self._live else None)
 
     def _meet_screens(self, transport: Transport, frame: int) -> None:
         """On the display rank: wait for every other screen's part of a frame, so that it is done when all are."""

@@ -22,18 +22,25 @@ if TYPE_CHECKING:
     from ..nodes.raster.paged_points import Residency
 
 RECORD_VERSION = 1
+KEPT_FRAMES = 64
+"""Frames whose times and counts a live run keeps: more than balancing looks at (``balance.times``)."""
 
 
 class StageClock:
     """Times of one stage, frame by frame: seconds of work, of the processor in it, and of waiting for messages
     or room.
+
+    keep : of the latest frames so many at least, and fewer than twice as many; None: all. A live run lasts for days.
+    frames, worked_s, waited_s : of all frames so far, kept or not.  dropped : frames that are not kept.
     """
 
-    def __init__(self, stage: str) -> None:
-        self.stage = stage
+    def __init__(self, stage: str, keep: int | None = None) -> None:
+        self.stage, self.keep = stage, keep
         self.work_s: list[float] = []
         self.cpu_s: list[float] = []
         self.wait_s: list[float] = []
+        self.frames = self.dropped = 0
+        self.worked_s = self.waited_s = 0.0
 
     @contextmanager
     def working(self) -> Iterator[None]:
@@ -42,6 +49,10 @@ class StageClock:
         yield
         self.cpu_s.append(time.process_time() - cpu)
         self.work_s.append(time.perf_counter() - start)
+        self.frames += 1
+        self.worked_s += self.work_s[-1]
+        self.dropped += _keep_latest(self.work_s, self.keep)
+        _keep_latest(self.cpu_s, self.keep)
 
     @contextmanager
     def waiting(self) -> Iterator[None]:
@@ -49,6 +60,8 @@ class StageClock:
         start = time.perf_counter()
         yield
         self.wait_s.append(time.perf_counter() - start)
+        self.waited_s += self.wait_s[-1]
+        _keep_latest(self.wait_s, self.keep)
 
     def summary(self) -> dict[str, Any]:
         """Median, spread and sum of the work in milliseconds; the sum of waiting in seconds."""
@@ -60,10 +73,13 @@ class FrameCounts:
     of those, the pooled ones; objects of layers.
 
     lists : counts to begin with, as of ``lists``.
+    keep : as of ``StageClock``.
     """
 
-    def __init__(self, lists: dict[str, list[Any]] | None = None) -> None:
+    def __init__(self, lists: dict[str, list[Any]] | None = None, keep: int | None = None) -> None:
         self._lists: dict[str, list[Any]] = {} if lists is None else lists
+        self._keep = keep
+        self._totals: dict[str, tuple[int, int]] = {}
 
     def add(self, *messages: VisibilityBits | RenderPoints) -> None:
         """Count a frame's messages. Outside the stage clocks: it is no work of the pipeline."""
@@ -73,21 +89,41 @@ class FrameCounts:
             else:
                 found = {"entries": len(message.entries), "points": message.n_points, "pooled_points": message.n_pooled}
             for name, count in found.items():
-                self._lists.setdefault(name, []).append(count)
+                self._count(name, count)
 
     def add_layers(self, of_layers: Sequence[RenderPoints]) -> None:
         """Count the objects that a frame draws, a number for each layer; nothing where there is no layer."""
         if of_layers:
-            self._lists.setdefault("objects", []).append([chosen.n_points for chosen in of_layers])
+            objects = self._lists.setdefault("objects", [])
+            objects.append([chosen.n_points for chosen in of_layers])
+            _keep_latest(objects, self._keep)
 
     def add_residency(self, found: Residency | None) -> None:
         """Count what a frame found of paged points; nothing where points are resident."""
         for name, value in (asdict(found) if found else {}).items():
-            self._lists.setdefault(name, []).append(value)
+            self._count(name, value)
 
     def lists(self) -> dict[str, list[Any]]:
         """Name → one count a frame; ``objects``: one list a frame, a count for each layer."""
         return self._lists
+
+    def totals(self) -> dict[str, tuple[int, int]]:
+        """Name → frames that were counted so far and their sum, kept or not; none of layers."""
+        return self._totals
+
+    def _count(self, name: str, count: int) -> None:
+        values = self._lists.setdefault(name, [])
+        values.append(count)
+        _keep_latest(values, self._keep)
+        frames, total = self._totals.get(name, (0, 0))
+        self._totals[name] = frames + 1, total + count
+
+
+def _keep_latest(values: list[Any], keep: int | None) -> int:
+    """Drop the oldest once there are twice as many as are kept; how many were dropped."""
+    n = len(values) - keep if keep is not None and len(values) >= 2 * keep else 0
+    del values[:n]
+    return n
 
 
 def with_missing(per_frame: dict[str, list[Any]]) -> dict[str, list[Any]]:
@@ -126,9 +162,14 @@ def rank_record(role: str, rank: int) -> dict[str, Any]:
         "host": platform.node(),
         "pid": os.getpid(),
         "cores": len(os.sched_getaffinity(0)),
-        "rss_bytes": int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize(),
+        "rss_bytes": resident_bytes(),
         "peak_rss_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
     }
+
+
+def resident_bytes() -> int:
+    """Resident memory of this process now."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
 
 
 def machine_record() -> dict[str, Any]:

@@ -26,6 +26,7 @@ from .launch import (
     mpi_available,
     record,
     say_failed,
+    say_refused,
     started_rank,
 )
 from .plan.needs import left_out
@@ -148,11 +149,7 @@ def _attempt(
     if not any(statuses) and len(set(transport.agree(by_messages))) > 1:
         statuses, why = [InputError.exit_status] * transport.size, "scene.delivery: not the same on every rank"
     if config is None or any(statuses):
-        first = next(rank for rank in range(transport.size) if statuses[rank])
-        if transport.rank == first and (first or started_rank() == 0):  # or each of many worlds of one would say it
-            say_failed(f"rank {first} ({role}): {why}" if first else why, statuses[first])
-        transport.meet()  # so that the line is out before a rank ends
-        return max(statuses)
+        return say_refused(transport, statuses, f"rank {transport.rank} ({role})", why)
     pictures = transport.join(job.pictures if job and transport.rank == 0 else []).astype(int).tolist()
     begun_with = survival.pictures = pictures if survival.pictures is None else survival.pictures
     try:

@@ -80,6 +80,7 @@ class Transport:
         self._under_way: dict[int, deque[tuple[list[Any], Any]]] = defaultdict(deque)
         self._bytes: dict[str, int] = defaultdict(int)
         self._count: dict[str, int] = defaultdict(int)
+        self._received: dict[str, int] = defaultdict(int)
         self._left_behind: list[Any] = []  # requests whose memory MPI may still touch
 
     @property
@@ -152,6 +153,7 @@ class Transport:
         payload = np.empty(length, np.uint8)
         requests = [self._comm.Irecv([piece, self._mpi.BYTE], source, int(expected)) for piece in self._pieces(payload)]
         self._wait(requests, source, expected.name, self.timeout_s)
+        self._received[kind.name] += len(head) + length
         if is_coded(head):
             from ..shared.message_codecs import unpack
 
@@ -259,12 +261,18 @@ class Transport:
 
     def traffic(self) -> dict[str, dict[str, int]]:
         """Messages and bytes (headers included) this rank has sent, by kind."""
-        return {kind: {"count": self._count[kind], "bytes": n} for kind, n in self._bytes.items()}
+        sent = dict(self._bytes)  # a copy, since others may ask while this rank sends
+        return {kind: {"count": self._count[kind], "bytes": n} for kind, n in sent.items()}
+
+    def received_bytes(self) -> dict[str, int]:
+        """Bytes (headers included, coded as they came) this rank has received, by kind."""
+        return dict(self._received)
 
     def start_counting(self) -> None:
-        """Forget what ``traffic`` has counted so far."""
+        """Forget what ``traffic`` and ``received_bytes`` have counted so far."""
         self._bytes.clear()
         self._count.clear()
+        self._received.clear()
 
     def meet(self, meanwhile: Callable[[], None] | None = None) -> None:
         """Wait until every rank is here, for up to ``patience_s``: loading a scene takes its time. Collective.

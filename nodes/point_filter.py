@@ -97,6 +97,18 @@ class PointFilter:
             left[begin:end] &= left[octree.parent[begin:end]]
         return left
 
+    def keeps(self, positions: np.ndarray, classes: np.ndarray | None) -> np.ndarray:
+        """(n,) bool of (n, 3) float64 world positions and (n,) class codes, which may be None where none are chosen.
+
+        Bit by bit what ``filtered_x`` keeps; for a few points.
+        """
+        kept = np.ones(len(positions), bool)
+        if self.classes and classes is not None:
+            kept &= np.isin(classes, self.classes)
+        for box in self.boxes:
+            kept &= ((positions >= box.lower) & (positions <= box.upper)).all(axis=1) == box.keep_inside
+        return kept
+
     def filtered_x(self, scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
         """(n,) float32: a copy of ``x`` with NaN for each point that is filtered out.
 

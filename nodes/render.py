@@ -151,3 +151,14 @@ def load_points(scene: Scene, colouring: Colouring, wanted: Wanted = Wanted(), *
             pools = pools._replace(world_side=spacing[PooledForms.of(octree).cell])
         points = replace(points, pools=pools)
     return points
+
+
+def recoloured(points: ResidentPoints, scene: Scene, colouring: Colouring) -> ResidentPoints:
+    """The points of a scene, without pools, in other colours. Raises StoreError."""
+    return replace(points, colour=colour_words(scene, colouring))
+
+
+def refiltered(points: ResidentPoints, scene: Scene, point_filter: PointFilter) -> ResidentPoints:
+    """The points of a scene, without pools and features, of which another filter takes some out. Raises StoreError."""
+    x, y, z = scene.positions()
+    return replace(points, x=point_filter.filtered_x(scene, x, y, z) if point_filter else x)

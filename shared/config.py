@@ -210,6 +210,15 @@ class OutputSection(Section):
     resume: bool = False
 
 
+class LiveSection(Section):
+    """``[live]``: of ``splatpipe view``."""
+
+    fps: Annotated[float, Field(ge=1, le=240)] = 30.0
+    least_scale: Annotated[float, Field(ge=0.1, le=1)] = 0.25
+    jpeg_quality: Annotated[int, Field(ge=1, le=95)] = 75
+    still_after_s: Annotated[float, Field(ge=0.05, le=60)] = 0.25
+
+
 class RunConfig(Section):
     """Every setting of ``splatpipe run``."""
 
@@ -225,6 +234,7 @@ class RunConfig(Section):
     layers: list[LayerSection] = Field(default=[])
     pipeline: PipelineSection = PipelineSection()
     output: OutputSection = OutputSection()
+    live: LiveSection = LiveSection()
 
 
 _PATH_KEYS = (("scene", "path"), ("output", "directory"))

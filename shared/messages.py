@@ -6,7 +6,7 @@ pickled, and no length is believed before it is checked against what has arrived
 =================  ============================  ============================================================
 message            from → to                     payload
 =================  ============================  ============================================================
-``FrameStart``     coordinator → all             camera (clip_from_world, eye, viewport, near), number of the plan
+``FrameStart``     coordinator → all             camera (clip_from_world, eye, viewport, near), number of the plan, use
 ``VisibilityBits`` culling → sampling            1 bit a cell, breadth-first, packed (least significant first)
 ``RenderPoints``   sampling → render             entries of (offset, range, stride)
 ``SceneOffer``     sampling → render             ``scene.json`` and the colour mode
@@ -26,6 +26,7 @@ Protocol versions
     3. Framebuffers.
     4. Frames start by a plan; notes of plans and of stage times; pictures of films; coded payloads
        (``message_codecs``).
+    5. Frames start with what their picture is for, or as the end of a run that has no last frame.
 """
 
 from __future__ import annotations
@@ -42,11 +43,11 @@ from .errors import MessageError, StoreError
 from .scene_info import MAX_INFO_BYTES, SceneInfo, info_from_json
 
 MAGIC = b"SPLT"
-PROTOCOL_VERSION = 4
+PROTOCOL_VERSION = 5
 HEADER = struct.Struct("<4sHHQQ")
 CODED = 0x8000
 """Bit of a header's kind that says that the payload is coded (``message_codecs``)."""
-_FRAME_START = struct.Struct("<16d3d2IdI")
+_FRAME_START = struct.Struct("<16d3d2Id2I")
 _SCENE_REQUEST = struct.Struct("<IIQ")
 _MAX_COLOUR_BYTES = 64
 MAX_OFFER_BYTES = _MAX_COLOUR_BYTES + 1 + MAX_INFO_BYTES
@@ -83,12 +84,28 @@ class Kind(IntEnum):
     BUILD = 32
 
 
+class Use(IntEnum):
+    """What the picture of a frame is for."""
+
+    FILE = 0
+    """The outputs of a run."""
+    MOVING = 1
+    """To be looked at while the camera moves: speed before quality."""
+    STILL = 2
+    """To be looked at longer: not a bit lost."""
+    SCREENSHOT = 3
+    """To be kept by who looks."""
+    END = 4
+    """None: the run is over, there is nothing to draw."""
+
+
 @dataclass(frozen=True)
 class FrameStart:
-    """A frame is to be drawn: its camera, and the number of the plan (``cluster.layout.Plan``) that holds for it."""
+    """A frame is to be drawn: its camera, the number of the plan (``cluster.layout.Plan``) that holds for it, its use."""
 
     camera: Camera
     plan: int = 0
+    use: Use = Use.FILE
 
     @property
     def frame(self) -> int:
@@ -233,6 +250,7 @@ def encode(message: Message) -> tuple[bytes, memoryview]:
                     camera.height,
                     camera.near,
                     message.plan,
+                    message.use,
                 )
             )
             return header(Kind.FRAME_START, message.frame, len(payload)), payload
@@ -263,11 +281,13 @@ Bytes = bytes | bytearray | memoryview
 
 
 def decode_frame_start(frame: int, payload: Bytes) -> FrameStart:
-    """The start of a frame of a payload. Raises MessageError for a wrong length."""
+    """The start of a frame of a payload. Raises MessageError for a wrong length or an unknown use."""
     _expect(Kind.FRAME_START, len(payload), _FRAME_START.size)
     v = _FRAME_START.unpack(payload)
     camera = Camera(frame, np.array(v[:16]).reshape(4, 4), np.array(v[16:19]), v[19], v[20], v[21])
-    return FrameStart(camera, v[22])
+    if v[23] not in set(Use):
+        raise MessageError(f"FRAME_START: found use {v[23]}, expected at most {max(Use)}")
+    return FrameStart(camera, v[22], Use(v[23]))
 
 
 def decode_visibility(frame: int, payload: Bytes, n_cells: int) -> VisibilityBits:

@@ -45,6 +45,11 @@ class Views(Protocol):
     """The cameras of a run."""
 
     @property
+    def path(self) -> CameraPath:
+        """What pictures are taken from."""
+        ...
+
+    @property
     def per_picture(self) -> int:
         """Views that a picture is composed of."""
         ...

@@ -105,3 +105,6 @@ class ThreadTransport:
 
     def traffic(self):
         return {}
+
+    def received_bytes(self):
+        return {}

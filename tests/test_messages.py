@@ -12,6 +12,7 @@ from splatpipe.shared.messages import (
     FrameStart,
     Kind,
     RenderPoints,
+    Use,
     VisibilityBits,
     decode_frame_start,
     decode_render_points,
@@ -42,9 +43,9 @@ def through_bytes(message, n_cells=0):
 def test_a_camera_survives_to_the_bit():
     pose = look_at(np.array([6.4e6, -2.0, 1e-3]), np.array([6.4e6, 5.0, 0.0]), np.array([0.0, 0.0, 1.0]))
     camera = perspective_camera(frame=3, world_from_camera=pose, fov_y_rad=0.7, width=1920, height=1080, near=0.01)
-    start = through_bytes(FrameStart(camera, 7))
+    start = through_bytes(FrameStart(camera, 7, Use.STILL))
     got = start.camera
-    assert (start.frame, start.plan) == (3, 7)
+    assert (start.frame, start.plan, start.use) == (3, 7, Use.STILL)
     assert (got.frame, got.width, got.height, got.near) == (3, 1920, 1080, 0.01)
     assert got.clip_from_world.tobytes() == camera.clip_from_world.tobytes()
     assert got.eye.tobytes() == camera.eye.tobytes()
@@ -73,8 +74,8 @@ def test_render_points_survive_and_count_what_they_draw():
         (b"", "found 0 bytes, expected 24"),
         (header(Kind.FRAME_START, 0, 0)[:-1], "found 23 bytes"),
         (HEADER.pack(b"NOPE", 1, 1, 0, 0), "found magic b'NOPE'"),
-        (HEADER.pack(b"SPLT", 1, 1, 0, 0), "found protocol 1, expected 4"),
-        (HEADER.pack(b"SPLT", 4, 77, 0, 0), "found kind 77"),
+        (HEADER.pack(b"SPLT", 1, 1, 0, 0), "found protocol 1, expected 5"),
+        (HEADER.pack(b"SPLT", 5, 77, 0, 0), "found kind 77"),
     ],
 )
 def test_foreign_headers_are_refused(data, said):

@@ -20,6 +20,7 @@ def test_only_these_modules_import_mpi_opengl_and_sockets():
     allowed = {
         "mpi4py": ("cluster/transport.py",),
         "moderngl": ("nodes/raster/gl*.py", "nodes/layers/gl*.py"),
+        "jupyter_rfb": ("cluster/notebook.py",),
         "zmq": ("cluster/live/sockets.py",),
         "aiohttp": ("cluster/live/web.py",),
     }

@@ -56,7 +56,8 @@ class StageTimes:
 
 
 def taken(clock: StageClock, by_processor: bool, first: int = 0) -> np.ndarray:
-    """(n,) seconds of the frames of a stage from the ``first`` on."""
+    """(n,) seconds of the frames of a stage from the ``first`` on, as far as its clock keeps them."""
+    first = max(first - clock.dropped, 0)
     work = np.array(clock.work_s[first:])
     return np.minimum(work, clock.cpu_s[first:]) if by_processor else work
 

@@ -15,6 +15,7 @@ from typing import Any
 
 from ...shared.config import RunConfig, parse_config, read_config, read_toml, validated
 from ...shared.errors import ConfigError
+from ...shared.toml_text import toml_value
 from .config import ExperimentConfig
 
 Point = dict[str, Any]
@@ -112,7 +113,7 @@ def describe(point: Point) -> str:
 
 def overrides(point: Point) -> list[str]:
     """A point as ``--set`` arguments."""
-    return [f"{key}={_toml(value)}" for key, value in point.items()]
+    return [f"{key}={toml_value(value)}" for key, value in point.items()]
 
 
 def scene_folder(output: Path, name: str) -> Path:
@@ -174,12 +175,3 @@ def _check_names(config: ExperimentConfig, varied: set[str], source: str) -> Non
         if measure not in MEASURES:
             near = difflib.get_close_matches(measure, MEASURES, n=1, cutoff=0.0)
             raise ConfigError(f"{source}: measure = {measure!r}, did you mean {near[0]!r}?")
-
-
-def _toml(value: Any) -> str:
-    """A value as TOML text: JSON, but for tables and infinities, which JSON lacks."""
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{key} = {_toml(item)}" for key, item in value.items()) + "}"
-    if isinstance(value, list):
-        return "[" + ", ".join(map(_toml, value)) + "]"
-    return json.dumps(value, ensure_ascii=False)

@@ -33,6 +33,10 @@ class Services(Protocol):
         """[{"what", "why", "saves"}]."""
         ...
 
+    def expected(self, ranks: int, counts: dict[str, float]) -> list[dict[str, Any]]:
+        """``ranks`` of a ``prediction`` for a frame with these counts; nothing where there is no model of the run."""
+        ...
+
 
 class Worker:
     """Asks the services. answer : called in the loop with the viewer and the answer or refusal."""
@@ -52,6 +56,14 @@ class Worker:
         task = asyncio.get_running_loop().create_task(self._work(viewer, wanted, frame, settings))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
+
+    async def expected(self, ranks: int, counts: dict[str, float]) -> list[dict[str, Any]]:
+        """What the services expect of a frame; nothing where they fail."""
+        try:
+            call = asyncio.get_running_loop().run_in_executor(self._thread, self._services.expected, ranks, counts)
+            return await call
+        except Exception:  # a model that does not suit is no reason to do without metrics
+            return []
 
     async def _work(self, viewer: Viewer, wanted: Asked, frame: dict[str, Any], settings: dict[str, Any]) -> None:
         answer: dict[str, Any]

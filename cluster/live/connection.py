@@ -10,6 +10,7 @@ import json
 import os
 import stat
 import tempfile
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -35,11 +36,16 @@ class RunAddress:
         return {_VARIABLE + name.upper(): value for name, value in asdict(self).items()}
 
     @classmethod
-    def from_environment(cls) -> RunAddress | None:
-        """What ``to_variables`` gave; None in a run that nobody looks at."""
+    def from_variables(cls, variables: Mapping[str, str]) -> RunAddress | None:
+        """What ``to_variables`` gave, of the environment or another mapping; None in a run that nobody looks at."""
         names = [field.name for field in fields(cls)]
-        values = {name: os.environ.get(_VARIABLE + name.upper(), "") for name in names}
+        values = {name: variables.get(_VARIABLE + name.upper(), "") for name in names}
         return cls(**values) if all(values.values()) else None
+
+    @classmethod
+    def from_environment(cls) -> RunAddress | None:
+        """That of the environment."""
+        return cls.from_variables(os.environ)
 
 
 @dataclass(frozen=True)
@@ -65,7 +71,8 @@ class Connection:
                 json.dump(asdict(self), stream)
             part.replace(path)
         except OSError as error:
-            part.unlink(missing_ok=True)
+            with suppress(OSError):  # as where there is no such folder
+                part.unlink(missing_ok=True)
             raise InputError(f"{path}: cannot write the connection file: {error.strerror}") from None
 
     @classmethod

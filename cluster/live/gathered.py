@@ -40,6 +40,20 @@ class Gathered:
         """A picture was acknowledged this long after its camera had come."""
         self._latencies.append(latency_s)
 
+    def counts(self) -> dict[str, float]:
+        """Of the latest frame, all ranks together: ``cells``, ``entries``, ``points``, ``pixels``, ``frames_per_s``;
+        nothing while one is missing.
+        """
+        said: dict[str, list[float]] = {name: [] for name in ("cells", "entries", "points", "pixels", "frames_per_s")}
+        for rank in self._ranks.values():
+            for name, values in said.items():
+                if name in rank["values"]:
+                    values.append(rank["values"][name])
+        if not all(said.values()):
+            return {}
+        summed = {name: sum(said[name]) for name in ("cells", "entries", "points")}
+        return summed | {name: max(said[name]) for name in ("pixels", "frames_per_s")}
+
     def message(self, run_s: float, n_viewers: int, n_pictures: int, n_bytes: int) -> dict[str, Any]:
         """The header ``metrics``; n_pictures, n_bytes : sent since the last one. Ranks that do not fit are left out."""
         now = time.monotonic()

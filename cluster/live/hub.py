@@ -91,6 +91,11 @@ class Hub:
                 self._loop.call_soon_threadsafe(self._stop.set)
             self._thread.join()
 
+    def end_run(self) -> None:
+        """Ask the run to end after the frame it is at; from any thread."""
+        with suppress(RuntimeError):  # the loop has ended meanwhile
+            self._loop.call_soon_threadsafe(self._to_run, {"kind": "quit"})
+
     def _run(self) -> None:
         try:
             asyncio.run(self._live())

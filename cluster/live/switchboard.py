@@ -72,8 +72,9 @@ class Switchboard:
         self._prediction: Parcel | None = None
         self._shown = self._shown_told = -1
         self._camera: dict[str, Any] | None = None
-        self._cameras_at: OrderedDict[tuple[int, float], float] = OrderedDict()  # (viewer, its t) → when it came
         self._n_watching = -1
+        self._predicted: dict[str, float] = {}
+        self._predicting: asyncio.Task[None] | None = None
         self._gathered = Gathered(host)
         self.unexpected: Exception | None = None
         """The first error of the hub's own that a message has brought about."""
@@ -193,21 +194,17 @@ class Switchboard:
             return
         if self._camera is None:
             asyncio.get_running_loop().call_soon(self._send_camera)  # once for all that come in this turn
-        self._camera = {**moved.model_dump(), "viewer": viewer.number}
+        self._camera = {**moved.model_dump(), "viewer": viewer.number, "at": time.monotonic()}
 
     def _send_camera(self) -> None:
         camera = self._camera
         if camera is not None and not self._closed and self._to_run(camera):
             self._camera = None
-            self._cameras_at[camera["viewer"], camera["t"]] = time.monotonic()
-            while len(self._cameras_at) > FRAMES_KNOWN:
-                self._cameras_at.popitem(last=False)
 
     def _first_shown(self, frame: int) -> None:
         self._shown = frame
         self._tell_shown()
-        started = self._frames.get(frame, {})
-        at = self._cameras_at.pop((started.get("viewer", 0), started.get("t", 0.0)), None)
+        at = self._frames.get(frame, {}).get("camera_at")
         if at is not None:
             self._gathered.shown(time.monotonic() - at)
 
@@ -290,7 +287,9 @@ class Switchboard:
         if started is None:
             return
         started.update(width=header["width"], height=header["height"])
-        self._picture = Parcel({**header, **{name: started.get(name) for name in ("view", "t", "viewer")}}, payload)
+        sent = {name: header[name] for name in ("kind", "frame", "width", "height", "encoding")}
+        begun = {name: started[name] for name in ("view", "t", "viewer", "still", "scale")}
+        self._picture = Parcel({**sent, **begun, "parts_ms": _parts_ms(started, header)}, payload)
         for viewer in self._viewers.values():
             if viewer.welcomed and viewer.pictures:
                 viewer.show(self._picture)
@@ -349,6 +348,20 @@ class Switchboard:
             pictures, n_bytes = self._sent()
             n_viewers = sum(viewer.welcomed for viewer in self._viewers.values())
             self._tell(self._gathered.message(now - self._ready_at, n_viewers, pictures, n_bytes))
+            self._predict()
+
+    def _predict(self) -> None:
+        """Have it worked out, if anybody looks at it, what the model expects of frames as they are now."""
+        counts = self._gathered.counts()
+        wanted = any(viewer.welcomed and viewer.metrics for viewer in self._viewers.values())
+        if wanted and counts and counts != self._predicted and (self._predicting is None or self._predicting.done()):
+            self._predicted = counts
+            self._predicting = asyncio.get_running_loop().create_task(self._tell_prediction(counts))
+
+    async def _tell_prediction(self, counts: dict[str, float]) -> None:
+        ranks = await self._worker.expected(len((self._ready or {})["run"]["ranks"]), counts)
+        if ranks and not self._closed:
+            self._tell({"kind": "prediction", "ranks": ranks})
 
     def _look_after(self, viewer: Viewer, now: float) -> None:
         if viewer.gone:
@@ -378,3 +391,21 @@ class Switchboard:
     def close_worker(self) -> None:
         """Wait for the services."""
         self._worker.close()
+
+
+def _parts_ms(started: dict[str, Any], picture: dict[str, Any]) -> dict[str, float]:
+    """Where the time went from a camera's arrival here to that of its picture; clocks are those of one host."""
+    moments = {
+        "to_run": started["asked_at"],
+        "waiting": started["begun_at"],
+        "drawing": picture["composed_at"],
+        "queued": picture["encoding_at"],
+        "encoding": picture["sent_at"],
+        "to_hub": time.monotonic(),
+    }
+    parts, before = {}, started["camera_at"]
+    for name, at in moments.items():
+        if before is not None:  # of a picture that no camera has asked for, all but the first
+            parts[name] = round(1e3 * max(at - before, 0.0), 2)
+        before = at
+    return parts

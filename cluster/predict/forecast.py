@@ -76,7 +76,7 @@ def forecast(costs: Costs, load: Workload | Parts, setting: Setting, machine: Ma
     by_one = [step.seconds(n_frames, waiting=False) for step in one]
     pools = [None if step.rank is None else machine.pool_of(step.rank) for step in steps]
     crowded = len({rank for rank in layout.workers if machine.pool_of(rank) == machine.pool_of(0)}) > 1
-    factor = [_inflation(step.threads, costs.contention, machine.cores) for step in steps]
+    factor = [inflation(step.threads, costs.contention, machine.cores) for step in steps]
     for _ in range(ROUNDS):
         stages = []
         for i, step in enumerate(steps):
@@ -91,7 +91,7 @@ def forecast(costs: Costs, load: Workload | Parts, setting: Setting, machine: Ma
             for key in ((pools[i], step.rank), (pools[i], None)):
                 busy[key] = busy.get(key, 0.0) + share
         wanted = [
-            _inflation(s.threads + busy[pool, None] - busy[pool, s.rank], costs.contention, machine.cores)
+            inflation(s.threads + busy[pool, None] - busy[pool, s.rank], costs.contention, machine.cores)
             if s.threads
             else 1.0
             for s, pool in zip(steps, pools, strict=True)
@@ -114,7 +114,7 @@ def _whole_pictures(costs: Costs, load: Workload, setting: Setting, machine: Mac
         setting,
         schedule,
         steps[:1],
-        {"pictures": _inflation(here - 1 + setting.threads, costs.contention, machine.cores)},
+        {"pictures": inflation(here - 1 + setting.threads, costs.contention, machine.cores)},
     )
 
 
@@ -124,7 +124,7 @@ def picture_step(costs: Costs, load: Workload, machine: Machine, threads: int, h
     step.add("work", costs.loop_s / machine.speed)
     for stage in STAGES:
         of_stage = threads if stage == "render" else 1
-        slower = _inflation(here - 1 + of_stage, costs.contention, machine.cores)
+        slower = inflation(here - 1 + of_stage, costs.contention, machine.cores)
         for name, seconds in stage_parts(costs, stage, load, of_stage).items():
             step.add(name, seconds * slower / machine.speed)
     step.add("messages", costs.message_s / machine.speed * messages)
@@ -154,5 +154,6 @@ def _error(costs: Costs, run: Measured, machine: Machine) -> float:
     return forecast(costs, run.load, run.setting, machine).frames_per_s * run.frame_s - 1
 
 
-def _inflation(busy: float, contention: float, cores: int) -> float:
+def inflation(busy: float, contention: float, cores: int) -> float:
+    """How many times longer work takes while so many cores, its own among them, are busy."""
     return max(1.0, busy / cores) * (1 + contention * max(min(busy, cores) - 1, 0.0))

@@ -154,6 +154,14 @@ def _pixels_per_point(
     return float(np.where(inside, np.rint(side) ** 2, 0).mean())
 
 
+def pixels_per_point(job: Job, octree: Octree, camera: Camera, entries: np.ndarray) -> float:
+    """Mean pixels that a point of (m,) RENDER_POINT covers in a picture of a camera."""
+    by_distance = job.point_size.world or job.point_size.adaptive
+    columns = job.scene.positions() if by_distance else None
+    spacing = _Spacing(job, octree) if job.point_size.adaptive else None
+    return _pixels_per_point(job, columns, spacing, camera, PooledForms.of(octree).as_ranges(octree, entries))
+
+
 def _sample(entries: np.ndarray) -> np.ndarray:
     """Indices into the point-array of up to ``SAMPLED_POINTS`` of the points of ranges, evenly spread over them."""
     counts = points_of(entries)

@@ -1,0 +1,167 @@
+// The monitor over the picture: where each rank's time goes, against the model, and any metric over the last minutes.
+
+import { $, h, iconButton, metric, ms, svg } from "./dom.js";
+
+const HISTORY_S = 120;
+const MAX_SERIES = 1024;
+const MAX_SAMPLES = 600;
+const MAX_CHARTS = 8;
+const FIGURES = ["frames_per_s", "queue", "points", "cells", "sent_bytes_per_s", "received_bytes_per_s", "memory_bytes", "cpu",
+  "cache_hits", "missing", "viewers", "pictures_per_s", "latency_ms"];
+const WORDS = {
+  frames_per_s: "frames", sent_bytes_per_s: "sent", received_bytes_per_s: "received", memory_bytes: "memory",
+  cache_hits: "cache hits", pictures_per_s: "pictures", latency_ms: "latency", cpu: "cores",
+};
+
+export class Monitor {
+  #series = new Map(); // "rank name" → [[t, value]]
+  #latest = new Map(); // rank → { rank, role, host, values }
+  #expected = new Map(); // rank → values
+  #chosen;
+
+  constructor(connection) {
+    this.connection = connection;
+    try {
+      this.#chosen = JSON.parse(localStorage.getItem("charts")) ?? [];
+    } catch {
+      this.#chosen = [];
+    }
+    this.ranks = $("ranks");
+    this.charts = $("charts");
+    this.choice = $("chart-choice");
+    this.choice.addEventListener("change", () => {
+      this.#choose([...this.#chosen, this.choice.value]);
+      this.choice.value = "";
+    });
+    $("left-out").addEventListener("click", () => this.#leftOut());
+    $("left-out-close").addEventListener("click", () => $("left-out-list").close());
+  }
+
+  /** A new connection: its times start anew. */
+  restart() {
+    this.#series.clear();
+    this.#latest.clear();
+    this.#expected.clear();
+    this.draw();
+  }
+
+  predicted({ ranks }) {
+    for (const { rank, values } of ranks ?? []) if (this.#expected.size < 4096) this.#expected.set(rank, values ?? {});
+    this.draw();
+  }
+
+  received({ t, ranks }) {
+    for (const rank of ranks ?? []) {
+      if (this.#latest.size < 4096 || this.#latest.has(rank.rank)) this.#latest.set(rank.rank, rank);
+      for (const [name, value] of Object.entries(rank.values ?? {})) {
+        const key = `${rank.rank} ${name}`;
+        let series = this.#series.get(key);
+        if (!series) {
+          if (this.#series.size >= MAX_SERIES) continue;
+          this.#series.set(key, (series = []));
+        }
+        if (Number.isFinite(value)) series.push([t, value]);
+        while (series.length > MAX_SAMPLES || series[0]?.[0] < t - HISTORY_S) series.shift();
+      }
+    }
+    this.draw();
+  }
+
+  draw() {
+    if (this.ranks.closest("[hidden]")) return;
+    const ranks = [...this.#latest.values()].sort((p, q) => p.rank - q.rank);
+    const times = ranks.map(({ rank, values }) => stages(values, this.#expected.get(rank)));
+    const most = Math.max(1, ...times.flat().map((s) => Math.max((s.work ?? 0) + s.wait, s.expected ?? 0)));
+    $("monitor-empty").hidden = ranks.length > 0;
+    this.ranks.replaceChildren(...ranks.map((rank, i) => this.#rank(rank, times[i], most)));
+    this.#offer();
+    this.#charts();
+  }
+
+  #rank({ rank, role, host, values }, times, most) {
+    const name = rank < 0 ? "hub" : `rank ${rank}`;
+    const bars = times.map(({ stage, work, wait, expected }) => {
+      const bar = h("span", { class: "bar", role: "img", "aria-label":
+        `${stage}: work ${ms(work ?? 0)}, wait ${ms(wait)}${expected === undefined ? "" : `, expected ${ms(expected)}`}` },
+      h("span", { class: "work" }), h("span", { class: "wait" }), expected !== undefined && h("span", { class: "expected" }));
+      bar.style.setProperty("--work", `${(100 * (work ?? 0)) / most}%`);
+      bar.style.setProperty("--wait", `${(100 * wait) / most}%`);
+      bar.style.setProperty("--expected", `${(100 * (expected ?? 0)) / most}%`);
+      return h("div", { class: "stage" }, h("span", {}, stage), bar, h("span", { class: "ms" }, work === undefined ? "–" : ms(work)));
+    });
+    const shown = FIGURES.filter((key) => Number.isFinite(values?.[key]));
+    const figures = shown.map((key) => h("span", { class: "stat" }, h("span", { class: "unit" }, WORDS[key] ?? key.replaceAll("_", " ")), metric(key, values[key])));
+    return h("section", { class: "rank", "aria-label": name },
+      h("h3", {}, name, h("span", { class: "unit" }, ` ${[rank < 0 ? "" : role, host].filter(Boolean).join(" · ")}`)),
+      bars, h("div", { class: "stats" }, figures));
+  }
+
+  #offer() {
+    const keys = [...this.#series.keys()].sort((p, q) => parseInt(p, 10) - parseInt(q, 10) || p.localeCompare(q));
+    const text = keys.join("\n");
+    if (text === this.offered || document.activeElement === this.choice) return;
+    this.offered = text;
+    const groups = Map.groupBy ? Map.groupBy(keys, (key) => key.split(" ")[0]) : new Map([["", keys]]);
+    this.choice.replaceChildren(h("option", { value: "" }, "Add a chart…"), ...[...groups].map(([rank, names]) =>
+      h("optgroup", { label: rank === "-1" ? "hub" : `rank ${rank}` }, names.map((key) => h("option", { value: key }, key.slice(rank.length + 1))))));
+    if (!this.#chosen.length) {
+      const first = ["frames_per_s", "render.work_ms"].map((name) => keys.find((key) => key.endsWith(` ${name}`)));
+      this.#chosen = first.filter(Boolean);
+    }
+  }
+
+  #choose(keys) {
+    this.#chosen = [...new Set(keys.filter(Boolean))].slice(-MAX_CHARTS);
+    localStorage.setItem("charts", JSON.stringify(this.#chosen));
+    this.draw();
+  }
+
+  #charts() {
+    this.charts.replaceChildren(...this.#chosen.map((key) => {
+      const [rank, name] = key.split(" ");
+      const series = this.#series.get(key) ?? [];
+      const values = series.map(([, value]) => value);
+      const [least, most] = [Math.min(...values, Infinity), Math.max(...values, -Infinity)];
+      const picture = svg("svg", { viewBox: "0 0 240 40", preserveAspectRatio: "none", role: "img",
+        "aria-label": values.length ? `${name}, from ${metric(name, least)} to ${metric(name, most)}` : `${name}, nothing yet` });
+      if (values.length > 1) {
+        const end = series.at(-1)[0];
+        const place = ([t, value]) => `${(240 - ((end - t) / HISTORY_S) * 240).toFixed(1)} ${(37 - (34 * (value - least)) / (most - least || 1)).toFixed(1)}`;
+        picture.append(svg("polyline", { points: series.map(place).join(" ") }));
+      }
+      return h("div", { class: "chart" },
+        h("div", { class: "chart-head" }, h("span", {}, name, h("span", { class: "unit" }, rank === "-1" ? " hub" : ` rank ${rank}`)),
+          h("span", { class: "now" }, metric(name, values.at(-1))),
+          iconButton("close", `Remove the chart of ${name}`, () => this.#choose(this.#chosen.filter((k) => k !== key)))),
+        picture);
+    }));
+  }
+
+  async #leftOut() {
+    const body = $("left-out-body");
+    body.replaceChildren(h("p", { class: "hint" }, "Asking the run…"));
+    $("left-out-list").showModal();
+    try {
+      const { header } = await this.connection.request({ kind: "plan" });
+      const list = header.left_out ?? [];
+      body.replaceChildren(list.length
+        ? h("dl", { class: "left-out" }, list.map(({ what, why, saves }) => [
+          h("dt", {}, what, saves && h("span", { class: "unit" }, ` ${saves}`)), h("dd", {}, why)]))
+        : h("p", {}, "The run leaves nothing out."));
+    } catch (error) {
+      body.replaceChildren(h("p", {}, error.message));
+    }
+  }
+}
+
+/** [{ stage, work, wait, expected }], ms, of a rank's values; expected: the model's, work and what it says of waiting. */
+function stages(values = {}, expected = {}) {
+  const names = Object.keys({ ...values, ...expected }).filter((name) => name.endsWith(".work_ms")).map((name) => name.slice(0, -8));
+  const finite = (x) => (Number.isFinite(x) ? x : undefined);
+  return [...new Set(names)].map((stage) => ({
+    stage,
+    work: finite(values[`${stage}.work_ms`]),
+    wait: finite(values[`${stage}.wait_ms`]) ?? 0,
+    expected: finite(expected[`${stage}.work_ms`]),
+  }));
+}
