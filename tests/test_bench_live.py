@@ -18,7 +18,17 @@ def test_a_drag_is_timed_alone_and_beside_others(tmp_path):
     build_scene([CityScan(n_points=20_000)], tmp_path / "city.scene", settings=BuildSettings())
     config = tmp_path / "live.toml"
     config.write_text('[scene]\npath = "city.scene"\n[camera]\nwidth = 160\nheight = 90\n')
-    command = [sys.executable, SCRIPT, config, "--seconds", "0.6", "--settle", "0.3", "--set", "pipeline.topology=single"]
+    command = [
+        sys.executable,
+        SCRIPT,
+        config,
+        "--seconds",
+        "0.6",
+        "--settle",
+        "0.3",
+        "--set",
+        "pipeline.topology=single",
+    ]
     command += ["--set", "render.rasterizer=cpu", "--viewers", "4", "--slow", "1", "--vanish", "--fuzz"]
     done = subprocess.run([*command, "--json", tmp_path / "found.json"], capture_output=True, text=True, timeout=100)
     assert done.returncode == 0, done.stdout + done.stderr

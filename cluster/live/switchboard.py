@@ -288,7 +288,7 @@ class Switchboard:
             return
         started.update(width=header["width"], height=header["height"])
         sent = {name: header[name] for name in ("kind", "frame", "width", "height", "encoding")}
-        begun = {name: started[name] for name in ("view", "t", "viewer", "still", "scale")}
+        begun = {name: started.get(name) for name in ("view", "t", "viewer", "still", "scale")}
         self._picture = Parcel({**sent, **begun, "parts_ms": _parts_ms(started, header)}, payload)
         for viewer in self._viewers.values():
             if viewer.welcomed and viewer.pictures:
@@ -394,18 +394,21 @@ class Switchboard:
 
 
 def _parts_ms(started: dict[str, Any], picture: dict[str, Any]) -> dict[str, float]:
-    """Where the time went from a camera's arrival here to that of its picture; clocks are those of one host."""
+    """Where the time went from a camera's arrival here to that of its picture; clocks are those of one host.
+
+    A moment that nobody has told, such as that of a picture that no camera has asked for, belongs to no part.
+    """
     moments = {
-        "to_run": started["asked_at"],
-        "waiting": started["begun_at"],
-        "drawing": picture["composed_at"],
-        "queued": picture["encoding_at"],
-        "encoding": picture["sent_at"],
+        "to_run": started.get("asked_at"),
+        "waiting": started.get("begun_at"),
+        "drawing": picture.get("composed_at"),
+        "queued": picture.get("encoding_at"),
+        "encoding": picture.get("sent_at"),
         "to_hub": time.monotonic(),
     }
-    parts, before = {}, started["camera_at"]
+    parts, before = {}, started.get("camera_at")
     for name, at in moments.items():
-        if before is not None:  # of a picture that no camera has asked for, all but the first
+        if before is not None and at is not None:
             parts[name] = round(1e3 * max(at - before, 0.0), 2)
         before = at
     return parts
