@@ -68,7 +68,20 @@ def test_a_viewer_is_welcomed_when_the_run_is_ready_and_shown_its_last_picture(h
         with Client(hub.connection, pictures=True) as late:
             assert next_of(late, "picture").header == shown.header
         assert shown.payload == JPEG
-        assert shown.header == {**example.picture(1), "view": VIEW, "t": 4.5, "viewer": 0}
+        assert shown.header["parts_ms"].pop("to_hub") >= 0
+        assert shown.header == {
+            "kind": "picture",
+            "frame": 1,
+            "width": 64,
+            "height": 48,
+            "encoding": "jpeg",
+            "still": True,
+            "scale": 1.0,
+            "view": VIEW,
+            "t": 4.5,
+            "viewer": 0,
+            "parts_ms": {"drawing": 3.0, "queued": 1.0, "encoding": 2.0},
+        }
 
 
 def test_the_latest_camera_reaches_the_run_and_comes_back_with_the_picture(run, viewer):
@@ -78,6 +91,7 @@ def test_the_latest_camera_reaches_the_run_and_comes_back_with_the_picture(run, 
     until(lambda: run.last("camera", "t") == 149.0, "the last camera")
     steered = run.all("camera")
     assert [moved["t"] for moved in steered] == sorted(moved["t"] for moved in steered)
+    assert steered[-1].pop("at") <= time.monotonic()
     assert steered[-1] == {**camera(149.0), "viewer": number}
     frame = run.show(view=steered[-1]["view"], t=149.0, viewer=number)
     shown = next_of(viewer, "picture").header
@@ -94,9 +108,21 @@ def test_of_more_cameras_than_are_allowed_the_last_still_counts_and_of_others_no
     viewer.send(camera(5000.0))
     until(lambda: run.last("camera", "t") == 5000.0, "the last camera")
     assert len(run.all("camera")) < 1000
-    for _ in range(20):
-        viewer.send({"kind": "plan", "request": 1})
+    for _ in range(500):
+        viewer.send({"kind": "ack", "frame": 1})
     assert "messages a second" in next_of(viewer, "bye").header["why"]
+
+
+def test_who_floods_it_with_cameras_is_dropped(run, viewer, monkeypatch):
+    next_of(viewer, "welcome")
+    bye = None
+    for x in range(20_000):
+        viewer.send(camera(float(x)))
+        if x % 500 == 0 and (bye := viewer.receive(0.05)) is not None:
+            break
+    assert bye is not None
+    assert bye.kind == "bye"
+    assert "cameras a second" in bye.header["why"]
 
 
 def test_three_pictures_are_under_way_at_most_and_then_the_latest(run, viewer):
@@ -250,7 +276,7 @@ def test_metrics_of_all_ranks_in_one_message_with_the_hub_and_the_prediction(tmp
             link.send({"kind": "metrics", "rank": rank, "role": "render", "host": "here", "t": 1.0, "values": values})
         viewer.send(camera(1.0))
         run.told("camera")
-        frame = run.show(viewer=number, t=1.0)
+        frame = run.show(viewer=number, t=1.0, camera_at=run.last("camera", "at"))
         next_of(viewer, "picture")
         viewer.send({"kind": "ack", "frame": frame})
         until(lambda: "latency_ms" in str(next_of(viewer, "metrics").header), "the latency")
@@ -264,6 +290,16 @@ def test_metrics_of_all_ranks_in_one_message_with_the_hub_and_the_prediction(tmp
     assert [line["kind"] for line in lines[:2]] == ["welcome", "prediction"]
     assert {line["kind"] for line in lines[2:]} == {"metrics"}
     assert list(tmp_path.iterdir()) == [record]
+
+
+def test_what_the_model_expects_is_asked_for_frames_as_they_are(hub, run, answers):
+    with Client(hub.connection, metrics=True) as viewer:
+        next_of(viewer, "welcome")
+        counts = {"cells": 3, "entries": 5, "points": 7, "pixels": 9, "frames_per_s": 11.0}
+        for link, rank in ((run.coordinator, 0), (run.display, 2)):
+            link.send({"kind": "metrics", "rank": rank, "values": counts})
+        assert next_of(viewer, "prediction").header["ranks"][0]["values"] == {"render.work_ms": 14}
+    assert answers.asked[-1] == (1, {"cells": 6, "entries": 10, "points": 14, "pixels": 9, "frames_per_s": 11.0})
 
 
 def test_a_record_stops_with_a_note_where_it_is_full(tmp_path, monkeypatch):

@@ -74,7 +74,7 @@ class _File(NamedTuple):
 def page_files() -> dict[str, _File]:
     """Address → file, of the files with known suffixes in the package's own directory ``page``."""
     files: dict[str, _File] = {}
-    directory = resources.files(__package__).joinpath("page")
+    directory = resources.files("splatpipe.cluster.live").joinpath("page")
     for file in directory.iterdir() if directory.is_dir() else ():
         kind = TYPES.get(PurePath(file.name).suffix)
         if kind is not None and file.is_file():
@@ -127,7 +127,8 @@ class _PageOutlet:
 class Site:
     """Serves the page and takes its WebSockets.
 
-    bind, port : where; port 0: any.  token : what a WebSocket must have in its address.
+    bind : as it was asked for, a name by which requests may call this host.  address : what that is in numbers.
+    token : what a WebSocket must have in its address.
     connect : a new viewer, or None where there are too many.  said : what one says; raises MessageError for what nobody
     may say.  left : it has gone, or is to go for a reason.
     Raises InputError where the address cannot be had.
@@ -136,12 +137,13 @@ class Site:
     def __init__(
         self,
         bind: str,
+        address: str,
         token: str,
         connect: Callable[[_PageOutlet], Viewer | None],
         said: Callable[[Viewer, dict[str, Any]], None],
         left: Callable[[Viewer, str], None],
     ) -> None:
-        self._bind, self._token = bind, token
+        self._address, self._token = address, token
         self._connect, self._said, self._left = connect, said, left
         self._files = page_files()
         self._names = _names_of(bind)
@@ -150,7 +152,7 @@ class Site:
         self.port = 0
 
     async def start(self, port: int) -> None:
-        """Listen."""
+        """Listen; port 0: any."""
         app = web.Application(middlewares=[self._guard], client_max_size=1024, logger=_silent)
         app.router.add_get("/live", self._live)
         app.router.add_get("/{name:[^/]*}", self._file)
@@ -165,10 +167,12 @@ class Site:
         await self._runner.setup()
         try:
             loop = asyncio.get_running_loop()
-            self._listener = await loop.create_server(self._accept, self._bind, port, backlog=256, reuse_address=True)
+            self._listener = await loop.create_server(
+                self._accept, self._address, port, backlog=256, reuse_address=True
+            )
         except OSError as error:
             await self._runner.cleanup()
-            raise InputError(f"{self._bind}:{port}: cannot listen there: {error.strerror or error}") from None
+            raise InputError(f"{self._address}:{port}: cannot listen there: {error.strerror or error}") from None
         self.port = self._listener.sockets[0].getsockname()[1]
 
     def _accept(self) -> asyncio.BaseProtocol:
