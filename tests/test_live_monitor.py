@@ -13,7 +13,7 @@ import pytest
 from rich.console import Console
 from splatpipe.cluster.job import Job
 from splatpipe.cluster.live import monitor
-from splatpipe.cluster.live.board import HISTORY, MAX_SERIES, Board, text
+from splatpipe.cluster.live.board import HISTORY, MAX_SERIES, MAX_VALUES, Board, text
 from splatpipe.cluster.live.monitor import monitor_command
 from splatpipe.cluster.live.protocol import MAX_HEADER_BYTES
 from splatpipe.cluster.live.replay import replayed
@@ -78,7 +78,7 @@ def shown(board, width, colours=False):
 def say(target, *, terminal=False, width=100, **options):
     """What the command prints, but for JSON."""
     out = io.StringIO()
-    console = Console(file=out, width=width, force_terminal=terminal, highlight=False, soft_wrap=True)
+    console = Console(file=out, width=width, force_terminal=terminal, highlight=False)
     assert monitor_command(target, console=console, **options) == 0
     return out.getvalue()
 
@@ -130,6 +130,20 @@ def test_nothing_grows_with_time():
         board.hear(welcome())
     assert len(board.rate) == HISTORY == max(map(len, board.series.values()))
     assert len(board.ranks) == 4
+
+
+def test_a_run_that_rests_shows_the_times_that_it_had():
+    resting = metrics(9, rate=0.0)
+    for of in resting["ranks"]:
+        of["values"] = {name: value for name, value in of["values"].items() if not name.endswith("_ms")}
+    said = shown(board_of([*recorded(), resting]), 100)
+    assert "at rest" in said
+    assert "2  render    render    39.0 ms  3.00 ms    20.0 ms   1.95" in said
+    board = Board()
+    for i in range(1000):
+        values = {f"stage{i}.{j}_ms": 1.0 for j in range(96)}
+        board.hear({"kind": "metrics", "t": i, "ranks": [{"rank": 0, "values": values}]})
+    assert len(board.ranks[0].values) == MAX_VALUES
 
 
 def test_text_moves_no_cursor():

@@ -144,8 +144,8 @@ def _figures(board: Board, width: int) -> RenderableType:
     out = Text()
     rate = board.frames_per_s
     if rate is not None:
-        out.append(f"{rate:.1f}", style="bold")
-        out.append(f" frames/s{_expected_rate(board)} ")
+        out.append(f"{rate:.1f}" if rate else "at rest", style="bold")
+        out.append(f" frames/s{_expected_rate(board)} " if rate else " ")
         out.append(sparkline(board.rate, min(24, width // 4)), style="cyan")
     for name, value in _summary(board):
         out.append("   " if out else "")
