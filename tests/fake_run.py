@@ -13,6 +13,12 @@ from PIL import Image
 
 LOWER = np.array([500_000.0, 5_200_000.0, 100.0])
 UPPER = LOWER + np.array([200.0, 120.0, 40.0])
+HOME: dict[str, Any] = {
+    "eye": ((LOWER + UPPER) / 2 + np.array([0, -190.0, 120.0])).tolist(),
+    "target": ((LOWER + UPPER) / 2).tolist(),
+    "up": [0.0, 0.0, 1.0],
+    "fov_deg": 45.0,
+}
 DEFAULTS: dict[str, Any] = {
     "camera.width": 640,
     "camera.height": 360,
@@ -97,6 +103,9 @@ class FakeServices:
         lines = "".join(f"  {{ time = {key.time}, eye = {list(key.view.eye)} }},\n" for key in keys)
         return f'[camera]\npath = "keyframes"\nkeyframes = [\n{lines}]\n'
 
+    def expected(self, ranks: int, counts: dict[str, float]) -> list[dict[str, Any]]:
+        return [{"rank": 0, "values": {"render.work_ms": 14.0, "sampling.work_ms": 5.0}}]
+
     def left_out(self) -> list[dict[str, Any]]:
         return [{"what": "splats", "why": "the scene has no radii", "saves": "2 ms"}]
 
@@ -108,18 +117,13 @@ class FakeRun:
         self.points, self.classes = make_points()
         self.link: Any = None
         self.settings = dict(DEFAULTS)
-        eye = (LOWER + UPPER) / 2 + [0, -190.0, 120.0]
-        self.view = {
-            "eye": eye.tolist(),
-            "target": ((LOWER + UPPER) / 2).tolist(),
-            "up": [0.0, 0.0, 1.0],
-            "fov_deg": 45.0,
-        }
+        self.view = HOME
         self.cameras: list[dict[str, Any]] = []
         """The last cameras, as they came."""
         self.refuse = ""
         """A key that no change is allowed of."""
         self._frame = 0
+        self._due = threading.Event()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._live, name="fake run", daemon=True)
 
@@ -131,6 +135,12 @@ class FakeRun:
         self._stop.set()
         self._thread.join()
         self.link.close()
+
+    def reset(self) -> None:
+        """Everything as at the start."""
+        self.refuse, self.settings, self.view, self.cameras = "", dict(DEFAULTS), HOME, []
+        self.link.send({"kind": "settings", "settings": self.settings})
+        self._due.set()
 
     def project(
         self, eye: Any, target: Any, up: Any, fov_deg: float, width: int, height: int
@@ -176,41 +186,41 @@ class FakeRun:
     def _live(self) -> None:
         n = len(self.points)
         run = {"scene": "valley & village", "points": n, "cells": 64, "lower": LOWER.tolist(), "upper": UPPER.tolist(),
-               "up": "z", "attributes": ["rgb", "intensity", "classification"], "classes": [2, 5, 6, 9],
+               "up": [0.0, 0.0, 1.0], "attributes": ["rgb", "intensity", "classification"], "classes": [2, 5, 6, 9],
                "topology": "pipelined", "rasterizer": "cpu", "ranks": [{"rank": 0, "role": "render", "host": "here"}]}  # fmt: skip
         self.link.send({"kind": "ready", "run": run, "view": self.view, "settings": self.settings, "choices": CHOICES})
-        self.link.send(
-            {"kind": "prediction", "ranks": [{"rank": 0, "values": {"render.work_ms": 14.0, "sampling.work_ms": 5.0}}]}
-        )
         camera: dict[str, Any] = {"moving": False, "t": 0.0, "viewer": 0}
-        due, told, refine_at = True, 0.0, math.inf
+        told, refine_at = 0.0, math.inf
+        self._due.set()
         while not self._stop.is_set():
             for header, _ in self.link.receive(0.02):
                 if header["kind"] == "camera":
-                    camera, self.view, due = header, header["view"], True
+                    camera, self.view = dict(header), header["view"]
+                    self._due.set()
                     self.cameras = [*self.cameras[-200:], header]
                 elif header["kind"] == "settings":
-                    due = self._change(header) or due
+                    self._change(header)
                 elif header["kind"] == "screenshot":
                     self._send_picture(camera, header)
-            if due:
+            if self._due.is_set():
+                self._due.clear()
                 self._send_picture(camera)
                 refine_at = time.monotonic() + 0.15 if camera["moving"] else math.inf
-                due = False
             if time.monotonic() > refine_at:
                 camera = {**camera, "moving": False}
-                due = True
+                self._due.set()
             if time.monotonic() > told + 0.5:
                 told = time.monotonic()
                 self._send_metrics(told)
 
-    def _change(self, header: dict[str, Any]) -> bool:
+    def _change(self, header: dict[str, Any]) -> None:
         if self.refuse and self.refuse in header["set"]:
             why = f"{self.refuse}: not today"
             self.link.send({"kind": "refused", "viewer": header["viewer"], "request": header["request"], "why": why})
-            return False
+            return
         self.settings |= {key: DEFAULTS[key] if value is None else value for key, value in header["set"].items()}
-        return self.link.send({"kind": "settings", "settings": self.settings})
+        self.link.send({"kind": "settings", "settings": self.settings})
+        self._due.set()
 
     def _send_picture(self, camera: dict[str, Any], screenshot: dict[str, Any] | None = None) -> None:
         frame, self._frame = self._frame, self._frame + 1
@@ -218,22 +228,24 @@ class FakeRun:
         scale = 1.0 if still or screenshot else 0.75
         about = screenshot or {"width": self.settings["camera.width"], "height": self.settings["camera.height"]}
         width, height = max(1, round(about["width"] * scale)), max(1, round(about["height"] * scale))
-        started = {
-            "frame": frame,
-            "view": self.view,
-            "t": camera["t"],
-            "still": still,
-            "scale": scale,
-            "viewer": camera["viewer"],
-        }
-        asked = {name: screenshot[name] for name in ("viewer", "request")} if screenshot else None
-        self.link.send({"kind": "started", **started, "screenshot": asked})
+        now = time.monotonic()
+        self.link.send({
+            "kind": "started", "frame": frame, "view": self.view, "still": still, "scale": scale, "t": camera["t"],
+            "viewer": camera["viewer"], "camera_at": camera.get("at"), "asked_at": now, "begun_at": now,
+            "screenshot": {name: screenshot[name] for name in ("viewer", "request")} if screenshot else None,
+        })  # fmt: skip
+        if not screenshot:
+            camera["t"], camera["at"] = 0.0, None  # of one picture, not of another that follows by itself
         data = io.BytesIO()
-        encoding = "png" if still else "jpeg"
-        self.draw(width, height).save(data, encoding, **({"compress_level": 1} if still else {"quality": 80}))
+        image = self.draw(width, height)
+        composed = time.monotonic()
+        if still:
+            image.save(data, "png", compress_level=1)
+        else:
+            image.save(data, "jpeg", quality=80)
         header = {"kind": "screenshot" if screenshot else "picture", "frame": frame, "width": width, "height": height}
-        more = {} if screenshot else {"encoding": encoding, "still": still, "scale": scale, "parts_ms": {}}
-        self.link.send({**header, **more}, data.getvalue())
+        times = {"composed_at": composed, "encoding_at": composed, "sent_at": time.monotonic()}
+        self.link.send({**header, **times, "encoding": "png" if still else "jpeg"}, data.getvalue())
 
     def _send_metrics(self, now: float) -> None:
         wave = math.sin(now / 3)
@@ -241,5 +253,5 @@ class FakeRun:
             [("render", "render", 16), ("culling", "culling", 2), ("sampling", "sampling", 6)]
         ):
             values = {f"{stage}.work_ms": work + 2 * wave, f"{stage}.wait_ms": 18 - work + wave, "frames_per_s": 21 + 3 * wave,
-                      "queue": 2, "points": 1_234_567, "sent_bytes_per_s": 3.2e6, "memory_bytes": 4.2e8, "cpu": 0.8}  # fmt: skip
+                      "queue": 2, "points": 1_234_567, "cells": 120, "entries": 90, "pixels": 9.2e5, "sent_bytes_per_s": 3.2e6, "memory_bytes": 4.2e8, "cpu": 0.8}  # fmt: skip
             self.link.send({"kind": "metrics", "rank": rank, "role": role, "host": "here", "t": now, "values": values})

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fake_run import DEFAULTS, LOWER, UPPER, FakeRun, FakeServices
+from fake_run import LOWER, UPPER, FakeRun, FakeServices
 from PIL import Image
 
 pytest.importorskip("aiohttp", reason="the page needs aiohttp: pip install splatpipe[live]")
@@ -63,9 +63,7 @@ def hub(stage: tuple[Hub, FakeRun]) -> Hub:
 
 @pytest.fixture
 def run(stage: tuple[Hub, FakeRun]) -> FakeRun:
-    stage[1].refuse = ""
-    stage[1].settings = dict(DEFAULTS)
-    stage[1].link.send({"kind": "settings", "settings": stage[1].settings})
+    stage[1].reset()
     return stage[1]
 
 
@@ -95,6 +93,15 @@ def visit(browser: Any) -> Iterator[Callable[..., Any]]:
 
         yield visit
     assert errors == []
+
+
+@pytest.fixture(scope="module")
+def modules(browser: Any, stage: tuple[Hub, FakeRun]) -> Iterator[Any]:
+    """A page whose modules can be imported."""
+    page = browser.new_page()
+    page.goto(stage[0].url)
+    yield page
+    page.close()
 
 
 @pytest.fixture
@@ -147,7 +154,7 @@ def places(page: Any, points: list[list[float]]) -> np.ndarray:
         " splatpipe.picture.aspect, p)))",
         points,
     )
-    return np.array(found)
+    return np.array(found, float)
 
 
 def visible_points(page: Any, run: FakeRun, n: int) -> np.ndarray:
@@ -350,8 +357,8 @@ def test_the_monitor_shows_ranks_against_the_model_and_what_is_left_out(page, ru
 
 
 def test_it_comes_back_by_itself_after_a_loss(page, run, hub):
-    for viewer in list(hub._viewers.values()):
-        hub._loop.call_soon_threadsafe(hub._drop, viewer, "takes nothing")
+    for viewer in list(hub._board._viewers.values()):
+        hub._loop.call_soon_threadsafe(hub._board.leave, viewer, "takes nothing")
     page.get_by_text("Connection lost").wait_for()
     assert page.locator("#state").inner_text().startswith("reconnecting")
     run.link.send({"kind": "settings", "settings": {**run.settings, "camera.width": 640}})
@@ -495,10 +502,10 @@ MATH = """async ([up, lower, upper]) => {
     ("up", "centre", "extent"),
     [("z", 0.0, 1.0), ("y", 6.4e6, 100.0), ("-z", 6.4e6, 1.0), ("x", 0.0, 1e-6), ("-y", 0.0, 1e7), ("-x", -3.0, 5.0)],
 )
-def test_camera_mathematics(page, up, centre, extent):
+def test_camera_mathematics(modules, up, centre, extent):
     lower = [centre - extent, centre - extent / 2, centre - extent / 3]
     upper = [centre + extent, centre + extent / 2, centre + extent / 3]
-    found = page.evaluate(MATH, [up, lower, upper])
+    found = modules.evaluate(MATH, [up, lower, upper])
     slack = max(1e-9, 1e-15 * abs(centre) / extent * 100)
     corners = np.array(found["corners"])
     assert (corners[:, 2] > 0).all()

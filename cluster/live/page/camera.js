@@ -21,8 +21,15 @@ export const unit = (p) => {
   return times(scaled, 1 / length(scaled));
 };
 
-/** Axes { a, b, u } of a scene whose up is x, y, z, -x, -y or -z. */
+/** Axes { a, b, u } of a scene whose up is x, y, z, -x, -y or -z, or a vector. */
 export function basisOf(up) {
+  if (Array.isArray(up)) {
+    const u = unit(up);
+    const k = u.map(Math.abs).indexOf(Math.max(...u.map(Math.abs)));
+    if (Math.abs(u[k]) > 1 - 1e-12) return basisOf((u[k] < 0 ? "-" : "") + "xyz"[k]);
+    const a = unit(cross([0, 1, 2].map((i) => (i === (k + 2) % 3 ? 1 : 0)), u));
+    return { a, b: cross(u, a), u };
+  }
   const [a, b, u] = { x: [1, 2, 0], y: [2, 0, 1], z: [0, 1, 2] }[String(up ?? "z").replace("-", "")] ?? [0, 1, 2];
   const axis = (i, sign = 1) => [0, 1, 2].map((k) => (k === i ? sign : 0));
   const sign = String(up).startsWith("-") ? -1 : 1;

@@ -127,7 +127,10 @@ function pictureShown(header) {
   shownTimes.push(now);
   if (shownTimes.length > 240) shownTimes.shift();
   if (header.viewer === viewer) {
-    if (sent.delete(header.t)) latencies.push(now - header.t); // the lossless picture after it is no answer to a motion
+    if (sent.delete(header.t)) {
+      latencies.push(now - header.t);
+      monitor.answered(header.parts_ms, now - header.t);
+    }
     if (latencies.length > 2000) latencies.shift();
   } else if (header.view && !controls.busy && unsent === null && now - lastSteer > FOLLOW_MS) {
     camera = cameras.cameraOf(header.view, cameras.basisOf(run?.up), size); // somebody else steers

@@ -17,6 +17,7 @@ export class Monitor {
   #series = new Map(); // "rank name" → [[t, value]]
   #latest = new Map(); // rank → { rank, role, host, values }
   #expected = new Map(); // rank → values
+  #parts = []; // of the last pictures that answered a motion: { part: ms }
   #chosen;
 
   constructor(connection) {
@@ -42,6 +43,7 @@ export class Monitor {
     this.#series.clear();
     this.#latest.clear();
     this.#expected.clear();
+    this.#parts = [];
     this.draw();
   }
 
@@ -67,8 +69,35 @@ export class Monitor {
     this.draw();
   }
 
+  /** A picture that answered a motion: where its time went, ms; all of it took `whole`. */
+  answered(parts, whole) {
+    const told = Object.values(parts ?? {}).reduce((sum, x) => sum + x, 0);
+    if (!told) return;
+    this.#parts.push({ ...parts, page: Math.max(0, whole - told) });
+    if (this.#parts.length > 20) this.#parts.shift();
+  }
+
+  #pictureParts() {
+    const box = $("parts");
+    box.hidden = !this.#parts.length;
+    if (box.hidden) return;
+    const mean = (name) => this.#parts.reduce((sum, parts) => sum + (parts[name] ?? 0), 0) / this.#parts.length;
+    const parts = Object.keys(this.#parts.at(-1)).map((name) => [name, mean(name)]);
+    const sum = parts.reduce((total, [, x]) => total + x, 0);
+    const words = parts.map(([name, x]) => `${name.replaceAll("_", " ")} ${ms(x)}`);
+    const bar = h("span", { class: "bar parts", role: "img", "aria-label": words.join(", ") });
+    for (const [name, x] of parts) {
+      const part = h("span", { title: `${name.replaceAll("_", " ")} ${ms(x)}` });
+      part.style.setProperty("width", `${(100 * x) / sum}%`);
+      bar.append(part);
+    }
+    box.replaceChildren(h("span", {}, "latency"), bar, h("span", { class: "ms" }, ms(sum)),
+      h("span", { class: "words unit" }, words.join(" · ")));
+  }
+
   draw() {
     if (this.ranks.closest("[hidden]")) return;
+    this.#pictureParts();
     const ranks = [...this.#latest.values()].sort((p, q) => p.rank - q.rank);
     const times = ranks.map(({ rank, values }) => stages(values, this.#expected.get(rank)));
     const most = Math.max(1, ...times.flat().map((s) => Math.max((s.work ?? 0) + s.wait, s.expected ?? 0)));
