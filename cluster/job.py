@@ -203,6 +203,11 @@ class Job:
         """The cells, with what the sampling node of this run needs of them. Raises StoreError."""
         return self.scene.octree(features=self.wanted.features, pools=self.wanted.pools)
 
+    def same_octree(self, other: Job) -> bool:
+        """Whether ``load_octree`` gives the same for a job of other settings of the same scene."""
+        held, wanted = other.wanted, self.wanted
+        return (held.features, held.pools) == (wanted.features, wanted.pools)
+
     def camera(self, frame: int) -> Camera:
         """The camera of a frame."""
         return self.views.camera(frame)

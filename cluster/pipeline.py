@@ -51,6 +51,7 @@ from .wall import screen_windows, writes_screens
 
 if TYPE_CHECKING:
     from ..shared.camera import Camera
+    from ..shared.octree import Octree
     from .balance.balancer import Balancer
     from .balance.times import StageTimes, TimesTeller
     from .live.rank import LiveRank
@@ -212,16 +213,18 @@ class FrameLoop:
             whole = job.load_octree()
             self._shares = shares_of(layout, whole)
             if selects:
-                own = self._shares and len(self._shares) == len(layout.lanes) > 1
-                self._lanes = [
-                    LaneCells(lane, whole, self._shares[i] if own else None) for i, lane in enumerate(layout.lanes)
-                ]
+                self._lanes = self._lanes_of(whole)
         self._adopt(first_plan(job, layout, self._lanes))
         first = layout.lanes[0]
         culls, samples = self._rank == first.culling[0], self._rank == first.sampling[0]
         layers = job.layer_nodes() if culls or samples else []
         self._layer_culling = [node for node, _ in layers] if culls else []
         self._layer_sampling = [node for _, node in layers] if samples else []
+
+    def _lanes_of(self, whole: Octree) -> list[LaneCells]:
+        lanes, shares = self._layout.lanes, self._shares
+        own = shares and len(shares) == len(lanes) > 1
+        return [LaneCells(lane, whole, shares[i] if own else None) for i, lane in enumerate(lanes)]
 
     def _adopt(self, plan: Plan) -> None:
         """Make this rank's parts what a plan says."""
@@ -232,14 +235,17 @@ class FrameLoop:
         self._plan = plan
         is_changed = self._live is not None and plan.settings != held.settings
         if self._live and is_changed:
-            self._job = self._live.changed(plan.settings)
+            before, self._job = self._job, self._live.changed(plan.settings)
             self._render = self._render and self._live.render(self._job)
+            if self._lanes and not self._job.same_octree(before):
+                self._lanes = self._lanes_of(self._job.load_octree())
         if self._lane is not None and (self._culls or self._samples):
             if is_changed or (held.culling, held.sampling) != (plan.culling, plan.sampling):
                 self._make_parts(self._lane, plan)
             for part in filter(None, (self._culling, self._sampling)):
                 part.look_through(self._layout, self._lane, plan)
-        self.adopting_s.append(time.process_time() - begun)
+        if not self._live:  # in which nobody asks, and for days
+            self.adopting_s.append(time.process_time() - begun)
 
     def _make_parts(self, lane: int, plan: Plan) -> None:
         ranks, cells = self._layout.lanes[lane], self._lanes[lane]

@@ -27,8 +27,7 @@ class Selected:
 
     def suits(self, job: Job) -> bool:
         """Whether the octree will do for a job of other settings of the same scene."""
-        held, wanted = self._job.wanted, job.wanted
-        return (held.features, held.pools) == (wanted.features, wanted.pools)
+        return job.same_octree(self._job)
 
     def points(self, camera: Camera) -> RenderPoints:
         """The points of a frame."""

@@ -13,7 +13,7 @@ from splatpipe.cluster.job import Job
 from splatpipe.cluster.layout import ALONE
 from splatpipe.cluster.live.protocol import LiveMessage, View
 from splatpipe.cluster.live.rank import LiveRank
-from splatpipe.cluster.live.settings import configured
+from splatpipe.cluster.live.settings import check_size, configured
 from splatpipe.cluster.live.view import live_config
 from splatpipe.cluster.live.views import camera_of
 from splatpipe.cluster.pipeline import FrameLoop
@@ -299,6 +299,58 @@ def test_a_screenshot_has_its_own_size_and_leaves_the_pictures_as_they_are(confi
         assert np.array_equal(picture, reference(config, LOW))
 
     live(config, [], topology, ranks, script)
+
+
+def test_a_filter_that_is_taken_away_brings_pools_back(forms, config):
+    """A run that begins without the pooled forms of its octree reads them when a setting allows them."""
+    box = {"lower": [0, 0, 0], "upper": [120, 90, 90]}
+    config.write_text(config.read_text() + f"[[filter.boxes]]\nlower = {box['lower']}\nupper = {box['upper']}\n")
+    sets = ["sampling.pools=bytes", f"scene.path={forms / 'pools'}"]
+
+    def script(hub):
+        hub.tell(kind="viewers", pictures=1)
+        hub.look(VIEW)
+        _, _, after = hub.still()
+        for boxes in ([], None):
+            hub.tell(kind="settings", set={"filter.boxes": boxes}, viewer=1, request=7)
+            _, after = hub.wait(lambda m: m.kind == "settings", after)
+            _, picture, after = hub.still(after)
+            settings = {} if boxes is None else {"filter.boxes": boxes}
+            assert np.array_equal(picture, reference(config, VIEW, settings, sets=sets))
+
+    live(config, sets, "pipelined", 3, script)
+
+
+def test_pictures_of_any_size_that_is_allowed_end_no_run(config):
+    """Larger than pictures that are drawn again and again, tiny, and with settings that have changed meanwhile."""
+
+    def script(hub):
+        hub.tell(kind="viewers", pictures=0)
+        for width, height, why in [(4096, 2100, None), (1, 1, None), (16384, 2048, None), (16384, 2049, "at most")]:
+            hub.tell(kind="screenshot", viewer=4, request=width, width=width, height=height)
+            answer, _ = hub.wait(lambda m, w=width, h=height: m.kind == "refused" or m.header.get("height") == h)
+            assert (answer.kind == "refused") == (why is not None)
+        hub.tell(kind="settings", set={"render.supersampling": 4}, viewer=4, request=5)
+        hub.tell(kind="screenshot", viewer=4, request=6, width=16384, height=16)
+        refused, _ = hub.wait(lambda m: m.kind == "refused" and m.header["request"] == 6)
+        assert refused.header["of"] == "screenshot"
+        hub.tell(kind="settings", set={"camera.width": 2048, "camera.height": 2048}, viewer=4, request=7)
+        refused, _ = hub.wait(lambda m: m.kind == "refused" and m.header["request"] == 7)
+        assert "supersampling" in refused.header["why"]
+
+    live(config, [], "sort-first", 4, script)
+
+
+def test_a_run_of_larger_pictures_than_viewers_may_ask_for_can_be_steered(config):
+    """Smaller ones while the camera moves are larger than what viewers may ask for, too."""
+    sets = ["camera.width=4096", "camera.height=2300", "sampling.points_per_pixel=0.1"]
+    given = live_config(load_config(config, sets))
+    job = Job(given)
+    with LiveRank(job, Hub().link()) as rank:
+        assert rank.changed({"camera.width": 4000, "camera.height": 2240}).views.width == 4000
+    check_size(configured(given, {"render.colour": "intensity"}), given)
+    with pytest.raises(ConfigError, match="take a screenshot"):
+        check_size(configured(given, {"camera.height": 2400}), given)
 
 
 def test_what_cannot_be_drawn_is_refused_to_who_asked_and_changes_nothing(config):

@@ -1,11 +1,14 @@
 """What the next picture of a live run is, by a clock that the test turns."""
 
+import numpy as np
 import pytest
 from splatpipe.cluster.live.protocol import View
 from splatpipe.cluster.live.settings import SETTABLE, changed, configured, settings_of
 from splatpipe.cluster.live.steering import SCALES, Scale, Steering
+from splatpipe.cluster.live.views import camera_of
+from splatpipe.nodes.raster import MAX_SIDE_PX
 from splatpipe.shared.config import LiveSection, RunConfig
-from splatpipe.shared.errors import ConfigError
+from splatpipe.shared.errors import ConfigError, InputError
 from splatpipe.shared.messages import Use
 
 HERE = View(eye=(0.0, 0.0, 10.0), target=(0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0))
@@ -180,3 +183,26 @@ def test_no_setting_names_a_file_a_rank_or_memory():
     sections = {key.split(".")[0] for key in SETTABLE}
     assert sections == {"camera", "sampling", "render", "filter", "live"}
     assert set(settings_of(RunConfig())) == set(SETTABLE)
+
+
+def test_screenshots_without_end_stop_nobodys_pictures():
+    made = steering(viewers=1, fps=10.0)
+    drawn(made, 0.0)
+    uses = []
+    for i in range(8):
+        now = 1.0 + 0.06 * i
+        made.looked(THERE, True, now, 1, now)
+        while made.shoot({"viewer": 2, "request": i, "width": 64, "height": 64}):
+            pass
+        uses.append(made.next(now).use)
+    assert uses[:4] == [Use.SCREENSHOT, Use.MOVING, Use.SCREENSHOT, Use.MOVING]
+
+
+def test_a_view_has_coordinates_of_which_a_camera_of_any_size_can_be_made():
+    for wrong in (1e300, -1e16, float("inf"), float("nan")):
+        with pytest.raises(ValueError, match="eye"):
+            View(eye=(0.0, wrong, 0.0), target=(0.0, 0.0, 0.0))
+    far = View(eye=(1e15, -1e15, -0.0), target=(0.0, 0.0, 5e-324), up=(5e-324, 0.0, 0.0), fov_deg=1e-3)
+    assert np.isfinite(camera_of(far, MAX_SIDE_PX, MAX_SIDE_PX, 0, 1.0).clip_from_world).all()
+    with pytest.raises(InputError, match="finite"):
+        camera_of(far.model_copy(update={"fov_deg": 1e-307}), MAX_SIDE_PX, MAX_SIDE_PX, 0, 1.0)

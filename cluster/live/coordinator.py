@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import platform
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from ...shared.config import LiveSection
+from ...nodes.raster import MAX_SIDE_PX
+from ...shared.config import LiveSection, RunConfig
 from ...shared.errors import SplatpipeError
 from ...shared.messages import FrameStart, Kind, Use
 from ...shared.windows import tiles
 from ..layout import Layout, Plan
 from .protocol import LiveMessage, View
-from .settings import changed, choices, configured, settings_of
+from .settings import changed, check_size, choices, configured, settings_of
 from .steering import Steering, Wanted
 from .views import camera_of, view_of
 
@@ -24,14 +26,14 @@ if TYPE_CHECKING:
     from ..transport import Transport
     from .sockets import RunLink
 
-MAX_SCREENSHOT_PIXELS = 1 << 25
-"""8K: some 0.8 GB of framebuffers with two threads."""
 _IN_FLIGHT = 2
 """Frames that are begun and not drawn: the next one is selected while one is drawn; more would be old when seen."""
 _POLL_S = 0.001
 """How long a coordinator that waits for ranks as well listens to the hub at a time."""
 _IDLE_S = 0.25
 _LATENCIES = 256
+_MAX_WHY = 400
+"""Characters of a refusal, since a message may quote what a viewer has said."""
 
 
 class LiveCoordinator:
@@ -118,9 +120,16 @@ class LiveCoordinator:
                 self._send(FrameStart(camera, self._plan.number, Use.END))
             return
         while self._has_room() and (wanted := self._steering.next(time.monotonic())):
-            self._start(wanted)
+            try:
+                self._start(wanted)
+            except SplatpipeError as error:
+                self._refuse({"kind": "screenshot", "viewer": wanted.viewer, **(wanted.screenshot or {})}, str(error))
 
     def _start(self, wanted: Wanted) -> None:
+        """Begin a picture. Raises ConfigError, InputError where it cannot be had; nothing has then been begun.
+
+        A rank that could not do what it is told would end the run: whatever can be wrong is found here.
+        """
         now = time.monotonic()
         (width, height), settings = wanted.size, dict(wanted.settings)
         given = self._job.config
@@ -128,12 +137,13 @@ class LiveCoordinator:
             settings |= {"camera.width": width, "camera.height": height}
         else:
             settings = {key: value for key, value in settings.items() if key not in ("camera.width", "camera.height")}
+        if wanted.screenshot and settings != self._plan.settings:  # others are checked when they are set
+            self._checked(settings, screenshot=True)
         drawn = int(settings.get("render.supersampling", given.render.supersampling))
+        camera = camera_of(wanted.view, width * drawn, height * drawn, self._frame, self._near)
         self._change_to(settings, width * drawn, height * drawn)
         frame, self._frame = self._frame, self._frame + 1
-        start = FrameStart(
-            camera_of(wanted.view, width * drawn, height * drawn, frame, self._near), self._plan.number, wanted.use
-        )
+        start = FrameStart(camera, self._plan.number, wanted.use)
         self._under_way.append((wanted.use, now))
         if not wanted.screenshot:
             self._steering.started(frame, now)
@@ -149,6 +159,7 @@ class LiveCoordinator:
             "camera_at": wanted.at,
             "asked_at": wanted.asked_s,
             "begun_at": now,
+            "host": platform.node(),
         }
         self._link.send(said | ({"screenshot": dict(wanted.screenshot)} if wanted.screenshot else {}))
 
@@ -202,13 +213,24 @@ class LiveCoordinator:
             }
             take.get(said["kind"], lambda: None)()
         except SplatpipeError as error:
-            refused = {"kind": "refused", "viewer": said.get("viewer", 0), "request": said.get("request", 0)}
-            self._link.send(refused | {"why": str(error)})
+            self._refuse(said, str(error))
+        except Exception as error:  # what one viewer says must not end the run of all
+            self._refuse(said, f"{said['kind']} failed: {type(error).__name__}")
+
+    def _refuse(self, said: Mapping[str, Any], why: str) -> None:
+        refused = {"kind": "refused", "viewer": said.get("viewer", 0), "request": said.get("request", 0)}
+        self._link.send(refused | {"of": said["kind"], "why": " ".join(why.split())[:_MAX_WHY]})
+
+    def _checked(self, settings: Mapping[str, Any], *, screenshot: bool = False) -> RunConfig:
+        """The configuration with these settings, which all ranks can have. Raises ConfigError. Cost: a few ms."""
+        config = configured(self._job.config, settings)
+        check_size(config, self._job.config, screenshot=screenshot)
+        self._job.with_config(config)  # refuses what does not suit the scene
+        return config
 
     def _set(self, wanted: Mapping[str, Any], viewer: int, now: float) -> None:
         settings = changed(self._steering.settings, wanted)
-        config = configured(self._job.config, settings)
-        self._job.with_config(config)  # refuses what does not suit the scene
+        config = self._checked(settings)
         self._steering.set(settings, (config.camera.width, config.camera.height), self._kept(config.live), viewer, now)
         self._link.send({"kind": "settings", "settings": settings_of(config)})
 
@@ -217,9 +239,6 @@ class LiveCoordinator:
         return live if self._job.resizes else live.model_copy(update={"least_scale": 1.0})
 
     def _shoot(self, said: Mapping[str, Any]) -> None:
-        if said["width"] * said["height"] > MAX_SCREENSHOT_PIXELS:
-            size = f"{said['width']} × {said['height']}"
-            raise SplatpipeError(f"screenshot: found {size} pixels, expected at most {MAX_SCREENSHOT_PIXELS:,}")
         if not self._steering.shoot(dict(said)):
             raise SplatpipeError("screenshot: too many are waiting")
 
@@ -228,6 +247,6 @@ class LiveCoordinator:
 
 
 def _usable(view: View) -> View:
-    """A view of which a camera can be made. Raises InputError."""
-    camera_of(view, 16, 16, 0, 1.0)
+    """A view of which a camera of any size can be made. Raises InputError."""
+    camera_of(view, MAX_SIDE_PX, MAX_SIDE_PX, 0, 1.0)
     return view

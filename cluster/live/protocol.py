@@ -25,7 +25,9 @@ MAX_NESTING = 8
 _LENGTH = struct.Struct("<I")
 
 Finite = Annotated[float, Field(allow_inf_nan=False, ge=-1e300, le=1e300)]
-Vector = tuple[Finite, Finite, Finite]
+Coordinate = Annotated[float, Field(allow_inf_nan=False, ge=-1e15, le=1e15)]
+"""Of a camera: what is made of it stays within the floats of the rasterizers."""
+Vector = tuple[Coordinate, Coordinate, Coordinate]
 Side = Annotated[int, Field(ge=1, le=16384)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Request = Annotated[int, Field(ge=0, lt=2**53)]

@@ -15,6 +15,10 @@ from ...shared.store import Scene
 
 MAX_PIXELS = 1 << 23
 """Of a picture that is drawn again and again; screenshots may have more."""
+MAX_DRAWN_PIXELS = 1 << 25
+"""Of the framebuffer of any picture, supersampled as it is: 8K once, or full HD sixteen times; some 0.8 GB with two
+threads.
+"""
 MAX_TEXT = 64
 
 COLORMAPS = ("viridis", "plasma", "inferno", "magma", "cividis", "turbo", "terrain", "gray", "coolwarm", "Spectral")
@@ -91,18 +95,37 @@ def changed(settings: Mapping[str, Any], wanted: Mapping[str, Any]) -> dict[str,
 
 
 def configured(config: RunConfig, settings: Mapping[str, Any]) -> RunConfig:
-    """A configuration with settings in place. Raises ConfigError naming the key."""
+    """A configuration with settings in place, whatever its size (``check_size``). Raises ConfigError naming the key."""
     if not settings:
         return config
     tables = config.model_dump()
     for key, value in settings.items():
         section, name = key.split(".")
         tables[section][name] = value
-    made = parse_config(tables, "settings")
-    if made.camera.width * made.camera.height > MAX_PIXELS:
-        size = f"{made.camera.width} × {made.camera.height}"
+    return parse_config(tables, "settings")
+
+
+def check_size(config: RunConfig, given: RunConfig, *, screenshot: bool = False) -> None:
+    """Raise ConfigError where a picture is larger than viewers may have it.
+
+    given : the configuration as the run was started with: what it draws viewers may have in any case.
+    """
+    (pixels, drawn), (given_pixels, given_drawn) = _pixels(config), _pixels(given)
+    size = f"{config.camera.width} × {config.camera.height}"
+    if not screenshot and pixels > max(MAX_PIXELS, given_pixels):
         raise ConfigError(f"settings: found {size} pixels, expected at most {MAX_PIXELS:,}: take a screenshot")
-    return made
+    if drawn > max(MAX_DRAWN_PIXELS, given_drawn):
+        times = config.render.supersampling**2
+        raise ConfigError(
+            f"{'screenshot' if screenshot else 'settings'}: found {size} pixels, drawn {times} times "
+            f"(render.supersampling), expected at most {MAX_DRAWN_PIXELS:,}"
+        )
+
+
+def _pixels(config: RunConfig) -> tuple[int, int]:
+    """Of a picture, and of its framebuffer."""
+    shown = config.camera.width * config.camera.height
+    return shown, shown * config.render.supersampling**2
 
 
 def _check(key: str, value: Any, about: Mapping[str, Any]) -> None:

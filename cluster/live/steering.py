@@ -95,6 +95,7 @@ class Steering:
     _due: Use | None = Use.STILL
     _last_s: float = -1e9
     _screenshots: deque[dict[str, Any]] = field(default_factory=deque)
+    _shot: bool = False
     _unseen: deque[tuple[int, float]] = field(default_factory=deque)
 
     def __post_init__(self) -> None:
@@ -134,13 +135,17 @@ class Steering:
             self._unseen.popleft()
 
     def next(self, now: float, room: int = 3) -> Wanted | None:
-        """The picture to begin now; None: none, or not yet (``wait_s``). room : unseen ones, at most."""
-        if self._screenshots:
-            shot = self._screenshots.popleft()
+        """The picture to begin now; None: none, or not yet (``wait_s``). room : unseen ones, at most.
+
+        A screenshot comes first, but not twice before a picture that is due: who takes many stops nobody's pictures.
+        """
+        if self._screenshots and not (self._shot and self._picture_wait_s(now, room) <= 0):
+            self._shot, shot = True, self._screenshots.popleft()
             of = {name: shot[name] for name in ("viewer", "request")}
             size = shot["width"], shot["height"]
             return Wanted(self.view, Use.SCREENSHOT, self.settings, size, 1.0, 0.0, shot["viewer"], now, None, of)
-        if not self.viewers or self.wait_s(now, room) > 0:
+        self._shot = False
+        if self._picture_wait_s(now, room) > 0:
             return None
         use = self._due or Use.STILL
         scale = self.scale.now if use is Use.MOVING else 1.0
@@ -153,8 +158,9 @@ class Steering:
 
     def wait_s(self, now: float, room: int = 3) -> float:
         """Seconds until the next picture may be begun if nobody says anything; a minute: not before somebody does."""
-        if self._screenshots:
-            return 0.0
+        return 0.0 if self._screenshots else self._picture_wait_s(now, room)
+
+    def _picture_wait_s(self, now: float, room: int) -> float:
         if not self.viewers:
             return 60.0
         while self._unseen and now - self._unseen[0][1] > _UNSEEN_S:

@@ -28,7 +28,7 @@ from .protocol import (
     ViewerMessage,
     said_by_viewer,
 )
-from .viewers import CAMERAS_PER_S, FLOOD_PER_S, HELLO_S, MESSAGES_PER_S, Outlet, Parcel, Viewer
+from .viewers import CAMERAS_PER_S, CHANGES_PER_S, FLOOD_PER_S, HELLO_S, MESSAGES_PER_S, Outlet, Parcel, Viewer
 
 MAX_VIEWERS = 256
 MAX_SCREENSHOTS_EACH = 2
@@ -75,6 +75,7 @@ class Switchboard:
         self._n_watching = -1
         self._predicted: dict[str, float] = {}
         self._predicting: asyncio.Task[None] | None = None
+        self._host = host
         self._gathered = Gathered(host)
         self.unexpected: Exception | None = None
         """The first error of the hub's own that a message has brought about."""
@@ -220,6 +221,8 @@ class Switchboard:
             raise InputError("the run has not started yet")
         asked = {"viewer": viewer.number, "request": message.request}
         if isinstance(message, SettingsWanted):
+            if not viewer.changes.take():
+                raise InputError(f"found more than {CHANGES_PER_S:g} changes a second")
             if not self._to_run({"kind": "settings", "set": message.set, **asked}):
                 raise InputError("the run is behind; try again")
         elif isinstance(message, ScreenshotWanted):
@@ -289,7 +292,7 @@ class Switchboard:
         started.update(width=header["width"], height=header["height"])
         sent = {name: header[name] for name in ("kind", "frame", "width", "height", "encoding")}
         begun = {name: started.get(name) for name in ("view", "t", "viewer", "still", "scale")}
-        self._picture = Parcel({**sent, **begun, "parts_ms": _parts_ms(started, header)}, payload)
+        self._picture = Parcel({**sent, **begun, "parts_ms": _parts_ms(started, header, self._host)}, payload)
         for viewer in self._viewers.values():
             if viewer.welcomed and viewer.pictures:
                 viewer.show(self._picture)
@@ -314,7 +317,8 @@ class Switchboard:
     def _run_refused(self, header: dict[str, Any], payload: bytes) -> None:
         viewer = self._viewers.get(header["viewer"])
         if viewer is not None:
-            viewer.screenshots.pop(header["request"], None)
+            if header.get("of") == "screenshot":
+                viewer.screenshots.pop(header["request"], None)
             self._refuse(viewer, header["request"], str(header["why"]))
 
     def _run_metrics(self, header: dict[str, Any], payload: bytes) -> None:
@@ -393,11 +397,13 @@ class Switchboard:
         self._worker.close()
 
 
-def _parts_ms(started: dict[str, Any], picture: dict[str, Any]) -> dict[str, float]:
-    """Where the time went from a camera's arrival here to that of its picture; clocks are those of one host.
+def _parts_ms(started: dict[str, Any], picture: dict[str, Any], host: str) -> dict[str, float]:
+    """Where the time went from a camera's arrival here to that of its picture.
 
-    A moment that nobody has told, such as that of a picture that no camera has asked for, belongs to no part.
+    A moment that nobody has told, such as that of a picture that no camera has asked for, belongs to no part; nor does
+    one of another host than ``host``, the hub's, since the clock there has begun at another time.
     """
+    started, picture = (said if said.get("host", host) == host else {} for said in (started, picture))
     moments = {
         "to_run": started.get("asked_at"),
         "waiting": started.get("begun_at"),

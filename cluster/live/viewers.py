@@ -25,8 +25,12 @@ MESSAGES_PER_S = 200.0
 CAMERAS_PER_S = 200.0
 """Cameras that are passed on; of more the latest counts. ``FLOOD_PER_S`` end the viewer."""
 FLOOD_PER_S = 2000.0
+CHANGES_PER_S = 60.0
+"""Changes of settings that are passed on, each of which the run checks against its scene; more are refused."""
 _BURST_S = 2.0
 _ANSWERS = 32
+_ANSWER_BYTES = 256 << 20
+"""Of payloads that wait; one is taken in any case."""
 
 
 class Parcel:
@@ -107,7 +111,7 @@ class Viewer:
         self.screenshots: dict[int, float] = {}
         """Request → when it was made."""
         self.messages, self.cameras = Allowance(MESSAGES_PER_S), Allowance(CAMERAS_PER_S)
-        self.flood = Allowance(FLOOD_PER_S)
+        self.flood, self.changes = Allowance(FLOOD_PER_S), Allowance(CHANGES_PER_S)
         self.late_camera: dict[str, Any] | None = None
         """The latest camera of those above the allowance."""
         self.sent_at = self.since = time.monotonic()
@@ -125,7 +129,8 @@ class Viewer:
 
     def answer(self, parcel: Parcel) -> bool:
         """Send this, after what has been said before. False: too many wait, the viewer takes nothing."""
-        if len(self._answers) >= _ANSWERS:
+        n_bytes = sum(len(waiting.payload) for waiting in self._answers)
+        if len(self._answers) >= _ANSWERS or (n_bytes and n_bytes + len(parcel.payload) > _ANSWER_BYTES):
             return False
         self._answers.append(parcel)
         self._wake.set()

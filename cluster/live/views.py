@@ -6,6 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
+from pydantic import ValidationError
 
 from ...shared.camera import Camera, look_at, perspective_camera
 from ...shared.errors import InputError
@@ -21,8 +22,8 @@ def camera_of(view: View, width: int, height: int, frame: int, near: float) -> C
 
     Raises InputError if eye and target coincide, or lie so far away that there is no camera.
     """
-    pose = look_at(np.array(view.eye), np.array(view.target), np.array(view.up))
     with np.errstate(all="ignore"):
+        pose = look_at(np.array(view.eye), np.array(view.target), np.array(view.up))
         camera = perspective_camera(
             frame=frame,
             world_from_camera=pose,
@@ -38,13 +39,18 @@ def camera_of(view: View, width: int, height: int, frame: int, near: float) -> C
 
 
 def view_of(job: Job) -> View:
-    """Where the first picture of a job is taken from: the same pose, whatever is up in it."""
+    """Where the first picture of a job is taken from: the same pose, whatever is up in it. Raises InputError where no
+    viewer may be (``protocol.Coordinate``).
+    """
     path = job.views.path
     pose, distance = path.path.pose(0.0), path.path.target_distance(0.0)
     eye = pose[:3, 3]
-    return View.model_validate({
-        "eye": tuple(eye.tolist()),
-        "target": tuple((eye - pose[:3, 2] * distance).tolist()),
-        "up": tuple(up_of_pose(pose, distance, path.up).tolist()),
-        "fov_deg": math.degrees(path.path.fov_y_rad(0.0)),
-    })  # fmt: skip
+    try:
+        return View.model_validate({
+            "eye": tuple(eye.tolist()),
+            "target": tuple((eye - pose[:3, 2] * distance).tolist()),
+            "up": tuple(up_of_pose(pose, distance, path.up).tolist()),
+            "fov_deg": math.degrees(path.path.fov_y_rad(0.0)),
+        })  # fmt: skip
+    except ValidationError:
+        raise InputError(f"camera: found eye {eye.tolist()}, too far away for a live run") from None
