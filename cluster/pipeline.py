@@ -42,9 +42,10 @@ from .compositing.tiles import Tiles
 from .coordinator import Coordinator, Progress
 from .delivery import receive_scene, serve_scene
 from .drawn import STAGES, Drawn, merged, told_of
-from .job import Job, RenderStage
+from .job import Job
 from .layout import ALONE, Layout, Plan
 from .record import KEPT_FRAMES, FrameCounts, StageClock, rank_record
+from .render_stage import RenderStage
 from .selection import CullingPart, LaneCells, SamplingPart, first_plan, merged_entries, shares_of, with_borders
 from .transport import Transport
 from .wall import screen_windows, writes_screens

@@ -18,7 +18,8 @@ from ..shared.errors import ConfigError, InputError
 from ..shared.messages import RenderPoints
 from ..shared.orbit import Orbit
 from ..shared.scene_info import SceneInfo
-from .job import Job, RenderStage
+from .job import Job
+from .render_stage import RenderStage
 from .selected import Selected, enlarged
 
 LAYERS = ("rgba", "depth", "normals")

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 from ...nodes.picture.compose import Picture
 from ...shared.messages import FrameStart
 from ...shared.store import Scene
-from ..job import Job, RenderStage
+from ..job import Job
 from ..record import FrameCounts, StageClock
+from ..render_stage import RenderStage
 from .metrics import Meter
 from .pictures import Pictures
 from .settings import configured
