@@ -178,6 +178,36 @@ def test_settings_go_to_the_run_and_its_answer_to_all_or_to_whom_it_concerns(hub
         assert next_of(late, "welcome").header["settings"] == {"live.fps": 24}
 
 
+def test_a_refusal_ends_no_screenshot_but_the_one_it_is_of(hub, run, viewer):
+    number = next_of(viewer, "welcome").header["viewer"]
+    viewer.send({"kind": "screenshot", "request": 0, "width": 64, "height": 48})
+    run.told("screenshot")
+    run.coordinator.send({"kind": "refused", "viewer": number, "request": 0, "of": "camera", "why": "no"})
+    assert next_of(viewer, "refused").header["why"] == "no"
+    run.coordinator.send({"kind": "started", "frame": 7, "screenshot": {"viewer": number, "request": 0}})
+    run.coordinator.send({"kind": "screenshot", "frame": 7, "width": 64, "height": 48}, b"PNG")
+    assert next_of(viewer, "screenshot").payload == b"PNG"
+
+
+def test_changes_above_what_is_allowed_are_refused(hub, run, monkeypatch):
+    monkeypatch.setattr("splatpipe.cluster.live.viewers.CHANGES_PER_S", 1.0)
+    with Client(hub.connection) as viewer:
+        next_of(viewer, "welcome")
+        for request in range(1, 10):
+            viewer.send({"kind": "settings", "set": {"live.fps": 12}, "request": request})
+        refused = next_of(viewer, "refused").header
+        assert refused["why"] == "found more than 60 changes a second"
+        assert [told["request"] for told in run.told("settings", 2)][:2] == [1, 2]
+        assert refused["request"] > 2
+
+
+def test_a_run_that_is_ended_before_it_is_there_is_told_when_it_comes(tmp_path, answers):
+    with Hub(answers, connection=tmp_path / "run.json") as hub:
+        hub.end_run()
+        with FakeRun(hub.run_address) as run:
+            run.told("quit")
+
+
 def test_a_screenshot_goes_to_who_asked_for_it(hub, run, viewer):
     with Client(hub.connection) as other:
         next_of(viewer, "welcome"), next_of(other, "welcome")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from splatpipe.cluster.live.protocol import View
-from splatpipe.cluster.live.settings import SETTABLE, changed, configured, settings_of
+from splatpipe.cluster.live.settings import SETTABLE, changed, check_size, configured, settings_of
 from splatpipe.cluster.live.steering import SCALES, Scale, Steering
 from splatpipe.cluster.live.views import camera_of
 from splatpipe.nodes.raster import MAX_SIDE_PX
@@ -160,6 +160,7 @@ def test_what_may_not_be_changed_is_refused_in_one_line(key, value, said):
     ("settings", "said"),
     [
         ({"camera.width": 4096, "camera.height": 4096}, "at most 8,388,608"),
+        ({"camera.width": 4096, "camera.height": 2048, "render.supersampling": 4}, "at most 33,554,432"),
         ({"filter.classes": [300]}, "filter.classes"),
         ({"filter.boxes": [{"lower": [0, 0], "upper": [1, 1, 1]}]}, "filter.boxes"),
         ({"render.colour_range": [1]}, "render.colour_range"),
@@ -167,7 +168,7 @@ def test_what_may_not_be_changed_is_refused_in_one_line(key, value, said):
 )
 def test_what_the_configuration_does_not_allow_is_refused_by_name(settings, said):
     with pytest.raises(ConfigError, match=said):
-        configured(RunConfig(), changed({}, settings))
+        check_size(configured(RunConfig(), changed({}, settings)), RunConfig())
 
 
 def test_settings_hold_in_place_of_the_configuration_until_they_are_taken_back():

@@ -85,7 +85,9 @@ class LiveCoordinator:
             self._hear(progress)
             longest = _POLL_S if self._under_way else _IDLE_S
             wait_s = min(self._steering.wait_s(time.monotonic()), longest) if self._has_room() else _POLL_S
-            for message in self._link.receive(0.0 if self._over else wait_s):
+            if self._over:
+                wait_s = _POLL_S if self._under_way else 0.0
+            for message in self._link.receive(wait_s):
                 self._take(message)
             self._begin()
         return self._ready.popleft()

@@ -67,6 +67,7 @@ class Hub:
         self._thread = threading.Thread(target=self._run, name="hub", daemon=True)
         self._ranks: set[bytes] = set()
         self._coordinator: bytes | None = None
+        self._ending = False
 
     def __enter__(self) -> Self:
         self._thread.start()
@@ -92,9 +93,10 @@ class Hub:
             self._thread.join()
 
     def end_run(self) -> None:
-        """Ask the run to end after the frame it is at; from any thread."""
+        """Ask the run to end after the frame it is at, or once it is ready; from any thread."""
+        self._ending = True
         with suppress(RuntimeError):  # the loop has ended meanwhile
-            self._loop.call_soon_threadsafe(self._to_run, {"kind": "quit"})
+            self._loop.call_soon_threadsafe(self._tell_end)
 
     def _run(self) -> None:
         try:
@@ -154,6 +156,11 @@ class Hub:
             await asyncio.sleep(TICK_S)
             self._board.tick()
             site.tick()
+            if self._ending:  # again, since rank 0 may have come meanwhile
+                self._tell_end()
+
+    def _tell_end(self) -> None:
+        self._to_run({"kind": "quit"})
 
     def _from_rank(self, peer: bytes, frames: list[bytes]) -> None:
         if len(frames) != 2:

@@ -51,13 +51,6 @@ class Listening:
     connection: Path | None = None
     record: Path | None = None
 
-    def arguments(self) -> list[str]:
-        """Of the command line."""
-        given = {"--connection": self.connection, "--record": self.record}
-        return [f"--bind={self.bind}", f"--port={self.port}", f"--zmq-port={self.zmq_port}"] + [
-            f"{name}={path}" for name, path in given.items() if path
-        ]
-
 
 def view_command(config_path: Path, overrides: list[str], listening: Listening) -> int:
     """Show a scene until somebody ends that; the exit status. Called by a person, or on each rank by ``mpiexec``."""
@@ -129,18 +122,17 @@ def _hub(config: RunConfig, listening: Listening) -> Iterator[Hub]:
 
 @contextmanager
 def _interrupted(hub: Hub) -> Iterator[None]:
-    """Where Ctrl-C, or a request to end, ends the run at its next frame; a second one does at once."""
+    """Where Ctrl-C ends the run at its next frame; a second one does at once."""
 
     def end(number: int, _: Any) -> None:
-        signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
+        signal.signal(number, signal.default_int_handler)
         hub.end_run()
 
-    held = {number: signal.signal(number, end) for number in (signal.SIGINT,)}
+    held = signal.signal(signal.SIGINT, end)
     try:
         yield
     finally:
-        for number, handler in held.items():
-            signal.signal(number, handler)
+        signal.signal(signal.SIGINT, held)
 
 
 def _run_rank(config_path: Path, overrides: list[str], listening: Listening) -> int:
