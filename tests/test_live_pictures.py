@@ -1,11 +1,13 @@
-"""Pictures of a live run between the display rank and the hub."""
+"""Pictures and screenshots of a live run on their way from the display rank to who asked for them."""
 
+import asyncio
 import threading
 
 import numpy as np
 import pytest
+from splatpipe.cluster.live.gathered import parts_ms
 from splatpipe.cluster.live.pictures import MAX_SCREENSHOTS, Pictures
-from splatpipe.cluster.live.switchboard import _parts_ms
+from splatpipe.cluster.live.viewers import Parcel, Viewer
 from splatpipe.shared.camera import Camera
 from splatpipe.shared.errors import SplatpipeError
 from splatpipe.shared.messages import FrameStart, Use
@@ -64,7 +66,31 @@ def test_what_ends_the_encoder_is_told_to_the_rank():
 def test_moments_of_other_hosts_belong_to_no_part():
     started = {"host": "a", "camera_at": 1.0, "asked_at": 1.5, "begun_at": 2.0}
     picture = {"host": "a", "composed_at": 3.0, "encoding_at": 3.5, "sent_at": 4.0}
-    assert list(_parts_ms(started, picture, "a")) == ["to_run", "waiting", "drawing", "queued", "encoding", "to_hub"]
-    assert list(_parts_ms(started, picture | {"host": "b"}, "a")) == ["to_run", "waiting"]
-    assert list(_parts_ms(started | {"host": "b"}, picture, "a")) == ["queued", "encoding", "to_hub"]
-    assert _parts_ms(started, picture, "c") == {}
+    assert list(parts_ms(started, picture, "a")) == ["to_run", "waiting", "drawing", "queued", "encoding", "to_hub"]
+    assert list(parts_ms(started, picture | {"host": "b"}, "a")) == ["to_run", "waiting"]
+    assert list(parts_ms(started | {"host": "b"}, picture, "a")) == ["queued", "encoding", "to_hub"]
+    assert parts_ms(started, picture, "c") == {}
+
+
+def test_answers_that_wait_are_few_bytes_whoever_asks_for_screenshots(monkeypatch):
+    monkeypatch.setattr("splatpipe.cluster.live.viewers._ANSWER_BYTES", 100)
+
+    class Outlet:
+        probed = False
+
+        async def send(self, parcel):
+            await asyncio.Event().wait()
+
+        def waiting_bytes(self):
+            return 0
+
+        def end(self, last):
+            pass
+
+    async def ask():
+        viewer = Viewer(1, Outlet())
+        taken = [viewer.answer(Parcel({"kind": "screenshot"}, bytes(n))) for n in (101, 0, 1)]
+        viewer.end(None)
+        return taken
+
+    assert asyncio.run(ask()) == [True, True, False]

@@ -207,3 +207,11 @@ def test_a_view_has_coordinates_of_which_a_camera_of_any_size_can_be_made():
     assert np.isfinite(camera_of(far, MAX_SIDE_PX, MAX_SIDE_PX, 0, 1.0).clip_from_world).all()
     with pytest.raises(InputError, match="finite"):
         camera_of(far.model_copy(update={"fov_deg": 1e-307}), MAX_SIDE_PX, MAX_SIDE_PX, 0, 1.0)
+
+
+def test_a_screenshot_is_no_longer_than_any_device_can_draw():
+    given = RunConfig()
+    sides = {"camera.width": 16384, "camera.height": 32}
+    check_size(configured(given, sides), given, screenshot=True)
+    with pytest.raises(ConfigError, match="at most 16384 px a side"):
+        check_size(configured(given, sides | {"render.supersampling": 2}), given, screenshot=True)

@@ -84,6 +84,29 @@ def finite(values: dict[str, Any]) -> dict[str, float]:
     return kept
 
 
+def parts_ms(started: dict[str, Any], picture: dict[str, Any], host: str) -> dict[str, float]:
+    """Where the time went from a camera's arrival here to that of its picture.
+
+    A moment that nobody has told, such as that of a picture that no camera has asked for, belongs to no part; nor does
+    one of another host than ``host``, the hub's, since the clock there has begun at another time.
+    """
+    started, picture = (said if said.get("host", host) == host else {} for said in (started, picture))
+    moments = {
+        "to_run": started.get("asked_at"),
+        "waiting": started.get("begun_at"),
+        "drawing": picture.get("composed_at"),
+        "queued": picture.get("encoding_at"),
+        "encoding": picture.get("sent_at"),
+        "to_hub": time.monotonic(),
+    }
+    parts, before = {}, started.get("camera_at")
+    for name, at in moments.items():
+        if before is not None and at is not None:
+            parts[name] = round(1e3 * max(at - before, 0.0), 2)
+        before = at
+    return parts
+
+
 class Record:
     """A file of JSON lines; complete under its name once closed. Stops with a note at ``MAX_RECORD_BYTES``.
 

@@ -19,6 +19,8 @@ MAX_DRAWN_PIXELS = 1 << 25
 """Of the framebuffer of any picture, supersampled as it is: 8K once, or full HD sixteen times; some 0.8 GB with two
 threads.
 """
+MAX_DRAWN_SIDE_PX = 1 << 14
+"""What any device with OpenGL 4.5 has room for in a texture; a rank that had not would end the run."""
 MAX_TEXT = 64
 
 COLORMAPS = ("viridis", "plasma", "inferno", "magma", "cividis", "turbo", "terrain", "gray", "coolwarm", "Spectral")
@@ -114,18 +116,23 @@ def check_size(config: RunConfig, given: RunConfig, *, screenshot: bool = False)
     size = f"{config.camera.width} × {config.camera.height}"
     if not screenshot and pixels > max(MAX_PIXELS, given_pixels):
         raise ConfigError(f"settings: found {size} pixels, expected at most {MAX_PIXELS:,}: take a screenshot")
+    found = f"{'screenshot' if screenshot else 'settings'}: found {size} pixels, render.supersampling = "
+    found += str(config.render.supersampling)
     if drawn > max(MAX_DRAWN_PIXELS, given_drawn):
-        times = config.render.supersampling**2
-        raise ConfigError(
-            f"{'screenshot' if screenshot else 'settings'}: found {size} pixels, drawn {times} times "
-            f"(render.supersampling), expected at most {MAX_DRAWN_PIXELS:,}"
-        )
+        raise ConfigError(f"{found}, expected at most {MAX_DRAWN_PIXELS:,} to be drawn")
+    if _longest_side(config) > max(MAX_DRAWN_SIDE_PX, _longest_side(given)):
+        raise ConfigError(f"{found}, expected at most {MAX_DRAWN_SIDE_PX} px a side to be drawn")
 
 
 def _pixels(config: RunConfig) -> tuple[int, int]:
     """Of a picture, and of its framebuffer."""
     shown = config.camera.width * config.camera.height
     return shown, shown * config.render.supersampling**2
+
+
+def _longest_side(config: RunConfig) -> int:
+    """Of a framebuffer, pixels."""
+    return max(config.camera.width, config.camera.height) * config.render.supersampling
 
 
 def _check(key: str, value: Any, about: Mapping[str, Any]) -> None:

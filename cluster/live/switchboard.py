@@ -14,7 +14,7 @@ from typing import Any
 
 from ...shared.errors import InputError, MessageError
 from .asked import Services, Worker
-from .gathered import Gathered
+from .gathered import Gathered, parts_ms
 from .protocol import (
     PROTOCOL_VERSION,
     RUN_KINDS,
@@ -292,7 +292,7 @@ class Switchboard:
         started.update(width=header["width"], height=header["height"])
         sent = {name: header[name] for name in ("kind", "frame", "width", "height", "encoding")}
         begun = {name: started.get(name) for name in ("view", "t", "viewer", "still", "scale")}
-        self._picture = Parcel({**sent, **begun, "parts_ms": _parts_ms(started, header, self._host)}, payload)
+        self._picture = Parcel({**sent, **begun, "parts_ms": parts_ms(started, header, self._host)}, payload)
         for viewer in self._viewers.values():
             if viewer.welcomed and viewer.pictures:
                 viewer.show(self._picture)
@@ -395,26 +395,3 @@ class Switchboard:
     def close_worker(self) -> None:
         """Wait for the services."""
         self._worker.close()
-
-
-def _parts_ms(started: dict[str, Any], picture: dict[str, Any], host: str) -> dict[str, float]:
-    """Where the time went from a camera's arrival here to that of its picture.
-
-    A moment that nobody has told, such as that of a picture that no camera has asked for, belongs to no part; nor does
-    one of another host than ``host``, the hub's, since the clock there has begun at another time.
-    """
-    started, picture = (said if said.get("host", host) == host else {} for said in (started, picture))
-    moments = {
-        "to_run": started.get("asked_at"),
-        "waiting": started.get("begun_at"),
-        "drawing": picture.get("composed_at"),
-        "queued": picture.get("encoding_at"),
-        "encoding": picture.get("sent_at"),
-        "to_hub": time.monotonic(),
-    }
-    parts, before = {}, started.get("camera_at")
-    for name, at in moments.items():
-        if before is not None and at is not None:
-            parts[name] = round(1e3 * max(at - before, 0.0), 2)
-        before = at
-    return parts

@@ -130,7 +130,9 @@ class Viewer:
     def answer(self, parcel: Parcel) -> bool:
         """Send this, after what has been said before. False: too many wait, the viewer takes nothing."""
         n_bytes = sum(len(waiting.payload) for waiting in self._answers)
-        if len(self._answers) >= _ANSWERS or (n_bytes and n_bytes + len(parcel.payload) > _ANSWER_BYTES):
+        if len(self._answers) >= _ANSWERS:
+            return False
+        if parcel.payload and n_bytes and n_bytes + len(parcel.payload) > _ANSWER_BYTES:
             return False
         self._answers.append(parcel)
         self._wake.set()
