@@ -204,10 +204,12 @@ function welcomed(header) {
   picture.restart();
   monitor.restart();
   sent.clear();
-  $("scene-name").textContent = run.scene;
-  $("scene-name").title = run.scene;
+  const name = run.scene.replace(/\.scene$/, "");
+  $("scene-name").textContent = name;
+  $("scene-name").title = name;
   $("scene-points").textContent = `${short(run.points)} points`;
-  document.title = `${run.scene} – splatpipe`;
+  document.title = `${name} – splatpipe`;
+  document.body.classList.remove("empty");
   panel.build(run, run.choices, settings, { Picture: [sizeChoice()] });
   for (const each of Object.values(tools)) each.show?.({});
   claimSize();
@@ -254,9 +256,9 @@ function notice() {
   const { name, why } = connection.state;
   const texts = {
     connecting: ["Connecting…", ""],
-    waiting: connection.everOpen ? ["Connection lost", `${why ? `${why}. ` : ""}It comes back by itself.`]
+    waiting: connection.everOpen ? ["Connection lost", `${why ? `The hub said: “${why}”. ` : ""}It comes back by itself.`]
       : ["No connection", "The run does not answer, or the token in the address is not its own."],
-    ended: ["The run has ended", why],
+    ended: ["The run has ended", [why === "the run is over" ? "" : `${why}.`, picture.shown ? "This is its last picture." : ""].join(" ")],
     open: ["Waiting for the first picture…", ""],
   };
   const settled = name === "open" ? picture.shown !== null : name === "connecting" && connection.everOpen;
@@ -344,7 +346,7 @@ const panelButtons = {
 const views = iconButton("views", "Views from the axes", () => {}, "1–6");
 views.setAttribute("popovertarget", "views-menu");
 const AXES = ["top", "front", "right", "bottom", "back", "left"];
-$("views-menu").append(...AXES.map((name, i) => h("button", { type: "button", role: "menuitem", onclick: () => {
+$("views-menu").append(...AXES.map((name, i) => h("button", { type: "button", onclick: () => {
   $("views-menu").hidePopover();
   axisView(name);
 } }, h("span", {}, name[0].toUpperCase() + name.slice(1)), h("kbd", {}, i + 1))));
@@ -384,8 +386,11 @@ addEventListener("keydown", (event) => {
   if (event.key === "Tab") root.dataset.tabbed = "";
   if (event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]")) return;
   const { target, key } = event;
-  if (target.matches?.("input:not([type=checkbox], [type=range]), select")) return;
-  if (target.matches?.("[type=range], [role=menuitem]") && key.startsWith("Arrow")) return;
+  if (target.matches?.("input:not([type=checkbox], [type=range]), select")) {
+    if (key === "Escape") $("scene").focus();
+    return;
+  }
+  if (target.matches?.("[type=range]") && key.startsWith("Arrow")) return;
   const does = KEYS[key.toLowerCase()];
   if (controls.key(event)) event.preventDefault();
   else if (does && !event.repeat) {
