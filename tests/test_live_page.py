@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import io
 import os
 import re
@@ -141,9 +142,8 @@ def at_rest(page: Any) -> int:
 
 
 def pixels(page: Any) -> np.ndarray:
-    data = page.evaluate("(async () => { const b = await new Promise(r => splatpipe.picture.canvas.toBlob(r));"
-                         " return [...new Uint8Array(await b.arrayBuffer())]; })()")  # fmt: skip
-    return np.asarray(Image.open(io.BytesIO(bytes(data))).convert("RGB"))
+    data = page.evaluate("splatpipe.picture.canvas.toDataURL().split(',')[1]")
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"))
 
 
 def drag(page: Any, start: tuple[float, float], end: tuple[float, float], button: str = "left") -> None:
@@ -420,23 +420,24 @@ def test_phones_get_sheets_and_fingers(visit, hub, run, width):
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_text_has_contrast(visit, hub, run, scheme):
-    page = visit(hub.url, color_scheme=scheme)
-    colours = page.evaluate("""() => ['--text', '--muted', '--accent', '--surface', '--raised', '--on-accent', '--tint'].map(name => {
-        const probe = document.createElement('i'); probe.style.color = `var(${name})`; document.body.append(probe);
-        const found = getComputedStyle(probe).color.match(/[0-9.]+/g).slice(0, 3).map(Number); probe.remove(); return found; })""")
+def test_text_has_contrast(modules, scheme):
+    modules.emulate_media(color_scheme=scheme)
+    colours = modules.evaluate(COLOURS)
     text, muted, accent, surface, raised, on_accent, tint = (_luminance(colour) for colour in colours)
-    pairs = [
-        (text, surface),
-        (muted, surface),
-        (accent, surface),
-        (text, raised),
-        (muted, raised),
-        (on_accent, accent),
-        (accent, tint),
-    ]
-    for one, two in pairs:
+    pairs = [(text, surface), (muted, surface), (accent, surface), (text, raised), (muted, raised)]
+    for one, two in [*pairs, (on_accent, accent), (accent, tint)]:
         assert (max(one, two) + 0.05) / (min(one, two) + 0.05) >= 4.5
+    assert (surface > text) == (scheme == "light")
+
+
+COLOURS = """['--text', '--muted', '--accent', '--surface', '--raised', '--on-accent', '--tint'].map(name => {
+    const probe = document.createElement('i');
+    probe.style.color = `var(${name})`;
+    document.body.append(probe);
+    const found = getComputedStyle(probe).color.match(/[0-9.]+/g).slice(0, 3).map(Number);
+    probe.remove();
+    return found;
+})"""
 
 
 def _luminance(rgb: list[float]) -> float:

@@ -12,6 +12,7 @@ import { Picture } from "./picture.js";
 import { MeasureTool, PickTool, ScreenshotTool } from "./tools.js";
 
 const RESIZE_MS = 200;
+const CAMERA_MS = 12; // between two cameras, however fast the screen is: the hub takes 200 messages a second
 const KEPT_TIMES = 512; // of cameras sent
 const FOLLOW_MS = 400; // after the last own camera, others may steer
 const PICK_S = 10;
@@ -50,6 +51,7 @@ let tool = null;
 const sent = new Set(); // t of cameras of which no picture has been shown
 let unsent = null; // moving, of a camera that waits for the next animation frame
 let lastSteer = -Infinity;
+let lastSent = -Infinity;
 
 function steer(next, moving) {
   if (!run) return;
@@ -61,8 +63,9 @@ function steer(next, moving) {
 }
 
 function sendCamera() {
-  if (unsent === null) return;
   const t = performance.now();
+  if (unsent === null || (unsent && t - lastSent < CAMERA_MS)) return;
+  lastSent = t;
   if (connection.send({ kind: "camera", view: cameras.viewOf(camera), moving: unsent, t })) {
     sent.add(t);
     if (sent.size > KEPT_TIMES) sent.delete(sent.values().next().value);

@@ -18,6 +18,7 @@ export class Monitor {
   #latest = new Map(); // rank → { rank, role, host, values }
   #expected = new Map(); // rank → values
   #parts = []; // of the last pictures that answered a motion: { part: ms }
+  #drawn = new Map(); // key → { element, draw(series) }
   #chosen = null; // keys of series; null: nobody has chosen yet
 
   constructor(connection) {
@@ -150,25 +151,42 @@ export class Monitor {
     this.draw();
   }
 
+  /** Charts stay in the page while their series grow, so that who is at a button of theirs is not thrown off it. */
   #charts() {
-    this.charts.replaceChildren(...this.#charted.map((key) => {
-      const [rank, name] = key.split(" ");
-      const series = this.#series.get(key) ?? [];
+    const wanted = this.#charted;
+    for (const [key, chart] of this.#drawn) {
+      if (wanted.includes(key)) continue;
+      chart.element.remove();
+      this.#drawn.delete(key);
+    }
+    for (const key of wanted) {
+      if (!this.#drawn.has(key)) this.#drawn.set(key, this.#chart(key));
+      const chart = this.#drawn.get(key);
+      if (!chart.element.isConnected) this.charts.append(chart.element);
+      chart.draw(this.#series.get(key) ?? []);
+    }
+  }
+
+  #chart(key) {
+    const [rank, name] = key.split(" ");
+    const line = svg("polyline");
+    const picture = svg("svg", { viewBox: "0 0 240 40", preserveAspectRatio: "none", role: "img" });
+    picture.append(line);
+    const now = h("span", { class: "now" });
+    const element = h("div", { class: "chart" },
+      h("div", { class: "chart-head" }, h("span", {}, name, h("span", { class: "unit" }, rank === "-1" ? " hub" : ` rank ${rank}`)), now,
+        iconButton("close", `Remove the chart of ${name}`, () => this.#choose(this.#charted.filter((k) => k !== key)))),
+      picture);
+    const draw = (series) => {
       const values = series.map(([, value]) => value);
-      const [least, most] = [Math.min(...values, Infinity), Math.max(...values, -Infinity)];
-      const picture = svg("svg", { viewBox: "0 0 240 40", preserveAspectRatio: "none", role: "img",
-        "aria-label": values.length ? `${name}, from ${metric(name, least)} to ${metric(name, most)}` : `${name}, nothing yet` });
-      if (values.length > 1) {
-        const end = series.at(-1)[0];
-        const place = ([t, value]) => `${(240 - ((end - t) / HISTORY_S) * 240).toFixed(1)} ${(37 - (34 * (value - least)) / (most - least || 1)).toFixed(1)}`;
-        picture.append(svg("polyline", { points: series.map(place).join(" ") }));
-      }
-      return h("div", { class: "chart" },
-        h("div", { class: "chart-head" }, h("span", {}, name, h("span", { class: "unit" }, rank === "-1" ? " hub" : ` rank ${rank}`)),
-          h("span", { class: "now" }, metric(name, values.at(-1))),
-          iconButton("close", `Remove the chart of ${name}`, () => this.#choose(this.#charted.filter((k) => k !== key)))),
-        picture);
-    }));
+      const [least, most] = [Math.min(...values), Math.max(...values)];
+      const end = series.at(-1)?.[0];
+      const place = ([t, value]) => `${(240 - ((end - t) / HISTORY_S) * 240).toFixed(1)} ${(37 - (34 * (value - least)) / (most - least || 1)).toFixed(1)}`;
+      line.setAttribute("points", series.map(place).join(" "));
+      now.textContent = metric(name, values.at(-1));
+      picture.setAttribute("aria-label", values.length ? `${name}, from ${metric(name, least)} to ${metric(name, most)}` : `${name}, nothing yet`);
+    };
+    return { element, draw };
   }
 
   async #leftOut() {
