@@ -14,6 +14,9 @@ compression              when messages are coded: measured links, trials
 launch, watch            starting ranks; who died, stopped or fell silent
 resume, survival         going on with a run cut short, or without a rank that died
 delivery                 a scene's arrays sent to the render rank
+api, scene_view          the same in Python: open a scene, render cameras
+notebook                 a widget that draws with it
+selected                 what a job would draw for a camera, and picking in that
 sink, progress, record   outputs; progress bars; what a run says about itself
 scenes, build_ranks      build, synth, info, verify; building on several ranks
 layers/                  layer: files → layers of objects

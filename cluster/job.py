@@ -176,6 +176,11 @@ class Job:
         return "cpu" if self.coded or self.paged else resolve_rasterizer(self.config.render.rasterizer)
 
     @property
+    def resizes(self) -> bool:
+        """Whether pictures of another size cost no more than their framebuffers: no point is held in another form."""
+        return self.rasterizer == "cpu" and not (self.compact or self.paged or self.layers)
+
+    @property
     def position_bytes(self) -> float:
         """Bytes of a position as it is read; compact ones as where cells are small on the screen, at least; coded ones
         as they are stored.

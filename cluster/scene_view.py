@@ -241,15 +241,16 @@ class SceneView:
             layers |= stage.layers
             stage = None
         if stage is None:
-            while len(self._stages) >= self._most_stages:
+            while len(self._stages) >= (MAX_STAGES if self.keeps_sizes else 1):
                 self._stages.pop(next(iter(self._stages))).stack.close()
             stage = self._open_stage(size, layers)
         self._stages[size] = stage  # the last in order: the one that is dropped last
         return stage
 
     @property
-    def _most_stages(self) -> int:
-        return MAX_STAGES if self._job.rasterizer == "cpu" and not self._job.paged else 1
+    def keeps_sizes(self) -> bool:
+        """Whether pictures of several sizes may be drawn in turn at no cost: points are in this process's memory."""
+        return self._job.rasterizer == "cpu" and not self._job.paged
 
     def _open_stage(self, size: tuple[int, int], layers: frozenset[str]) -> _Stage:
         config = self.config

@@ -261,7 +261,8 @@ class Transport:
 
     def traffic(self) -> dict[str, dict[str, int]]:
         """Messages and bytes (headers included) this rank has sent, by kind."""
-        return {kind: {"count": self._count[kind], "bytes": n} for kind, n in self._bytes.items()}
+        sent = dict(self._bytes)  # a copy, since others may ask while this rank sends
+        return {kind: {"count": self._count[kind], "bytes": n} for kind, n in sent.items()}
 
     def received_bytes(self) -> dict[str, int]:
         """Bytes (headers included, coded as they came) this rank has received, by kind."""

@@ -136,7 +136,8 @@ class Picker:
         while i < len(pieces) and not (best.beside_px == 0 and nearest[i] > best.depth):
             begun = int(ends[i - 1]) if i else 0
             j = max(i + 1, int(np.searchsorted(ends, begun + _BATCH, side="right")))
-            self._look_at(camera, pieces[i:j], world_side[i:j], column, row, tolerance_px, best)
+            widest = np.clip(world_side[i:j] * (camera.focal_px / nearest[i:j]), self._smallest, self._largest).max()
+            self._look_at(camera, pieces[i:j], widest, world_side[i:j], column, row, tolerance_px, best)
             i = j
         if best.index < 0:
             return None
@@ -233,44 +234,45 @@ class Picker:
         self,
         camera: Camera,
         pieces: np.ndarray,
+        widest_px: float,
         world_side: np.ndarray,
         column: int,
         row: int,
         tolerance_px: float,
         best: _Best,
     ) -> None:
-        """Hold the points of some pieces against the best."""
-        count = pieces["count"].astype(np.int64)
-        owner = pieces["segment"]
+        """Hold the points of some pieces, none of them wider than ``widest_px``, against the best."""
+        count, owner = pieces["count"].astype(np.int64), pieces["segment"]
         offset = self._offsets(pieces)
-        relative = offset + np.repeat(self._origin[owner] - camera.eye, count, axis=0)
-        u, v, w = camera.pixel_from_world[:, :3] @ relative.T
+        to_block = (self._origin[owner] - camera.eye).T
+        relative = offset + np.repeat(to_block, count, axis=1)
+        farthest = best.depth if best.beside_px == 0 and not self._splats else np.finfo(np.float32).max
+        reach = 0.5 * widest_px + tolerance_px + _ROUNDING_PX
         with np.errstate(all="ignore"):
-            u, v = u / w, v / w
-            side = np.repeat(world_side, count) * (camera.focal_px / w)
-            side = np.floor(np.clip(side, self._smallest, self._largest) + 0.5)
-            inside = (w >= camera.near) & (w <= np.finfo(np.float32).max)
-            beside = np.hypot(*(np.maximum(np.abs(p - at - 0.5) - side / 2, 0) for p, at in ((u, column), (v, row))))
-        near = np.flatnonzero(inside & (beside <= tolerance_px + _ROUNDING_PX))
+            u, v, w = camera.pixel_from_world[:, :3] @ relative
+            u, v = u / w - (column + 0.5), v / w - (row + 0.5)
+            near = np.flatnonzero((w >= camera.near) & (w <= farthest) & (np.abs(u) <= reach) & (np.abs(v) <= reach))
         if not len(near):
             return
-        u, v, w, side, beside, relative = (a[near] for a in (u, v, w, side, beside, relative))
-        piece = np.searchsorted(np.cumsum(count), near, side="right")
-        within = near - (np.cumsum(count) - count)[piece]
-        index = pieces["first"][piece] + within * pieces["stride"][piece].astype(np.int64)
-        position = self._origin[owner[piece]] + offset[near]
-        kept = self._filter.keeps(position, None if self._classes is None else self._classes[index])
+        u, v, w, relative = u[near], v[near], w[near], relative[:, near].T
+        ends = np.cumsum(count)
+        piece = np.searchsorted(ends, near, side="right")
+        index = pieces["first"][piece] + (near - (ends - count)[piece]) * pieces["stride"][piece].astype(np.int64)
+        position = self._origin[owner[piece]] + offset[:, near].T
         if self._splats:
             covers, w, beside = self._covered_by_discs(camera, index, relative, u, v, w, column, row)
         else:
-            left, top = np.floor(u - (side - 1) / 2), np.floor(v - (side - 1) / 2)
+            side = np.floor(np.clip(world_side[piece] * (camera.focal_px / w), self._smallest, self._largest) + 0.5)
+            left, top = (np.floor(p + at + 0.5 - (side - 1) / 2) for p, at in ((u, column), (v, row)))
             covers = (left <= column) & (column < left + side) & (top <= row) & (row < top + side)
+            beside = np.hypot(*(np.maximum(np.abs(p) - side / 2, 0) for p in (u, v)))
         beside = np.where(covers, 0.0, np.maximum(beside, np.finfo(np.float64).tiny))
-        kept &= covers | (beside <= tolerance_px)
+        kept = beside <= tolerance_px
+        kept &= self._filter.keeps(position, None if self._classes is None else self._classes[index])
         best.take(index[kept], w[kept], beside[kept], position[kept])
 
     def _offsets(self, pieces: np.ndarray) -> np.ndarray:
-        """(n, 3) float64: points of pieces relative to the origin of their block."""
+        """(3, n) float64: points of pieces relative to the origin of their block."""
         parts = []
         for first, count, stride, _ in pieces.tolist():
             stop = first + (count - 1) * stride + 1
@@ -278,7 +280,7 @@ class Picker:
                 parts.append(self._read(first, stop)[:, ::stride])
             else:
                 parts.append(np.stack([column[first:stop:stride] for column in self._columns]))
-        return np.concatenate(parts, axis=1).T.astype(np.float64)
+        return np.concatenate(parts, axis=1, dtype=np.float64)
 
     def _covered_by_discs(
         self,
@@ -293,6 +295,8 @@ class Picker:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Of splats: (k,) bool that the disc covers the pixel's centre, or the pixel holds the disc's; (k,) its depth
         there; (k,) how far beside it the disc ends, pixels, as if it faced the eye.
+
+        u, v : (k,) of the splats' centres from the middle of the pixel.
         """
         rows = camera.pixel_from_world[:, :3]
         ray = np.linalg.solve(rows, [column + 0.5, row + 0.5, 1.0])
@@ -303,8 +307,8 @@ class Picker:
             depth = (normal * relative).sum(axis=1) / (normal @ ray)
             covers = np.linalg.norm(depth[:, None] * ray - relative, axis=1) <= radius
         covers &= depth >= camera.near
-        holds = (np.floor(u) == column) & (np.floor(v) == row)
-        beside = np.maximum(np.hypot(u - column - 0.5, v - row - 0.5) - radius * (camera.focal_px / w), 0)
+        holds = (np.abs(u) <= 0.5) & (np.abs(v) <= 0.5)
+        beside = np.maximum(np.hypot(u, v) - radius * (camera.focal_px / w), 0)
         return covers | holds, np.where(covers, depth, w), beside
 
 

@@ -101,7 +101,7 @@ class Use(IntEnum):
 
 @dataclass(frozen=True)
 class FrameStart:
-    """A frame is to be drawn: its camera, the number of the plan (``cluster.layout.Plan``) that holds for it, its use."""
+    """A frame is to be drawn: its camera, the number of its plan (``cluster.layout.Plan``), and its use."""
 
     camera: Camera
     plan: int = 0

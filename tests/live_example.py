@@ -41,6 +41,10 @@ class Answers:
     def path(self, keys, fps, settings):
         return "x" * 100_000 if len(keys) > 1 else f"# {len(keys)} keys at {fps:g}"
 
+    def expected(self, ranks, counts):
+        self.asked.append((ranks, counts))
+        return [{"rank": 2, "values": {"render.work_ms": counts["points"]}}]
+
     def left_out(self):
         return [{"what": "edl", "why": "off", "saves": "2 ms"}]
 
@@ -73,8 +77,16 @@ class FakeRun:
     def show(self, payload: bytes = JPEG, **more: Any) -> int:
         """A frame is started, and its picture drawn; its number."""
         self.frame += 1
-        started = {"frame": self.frame, "view": VIEW, "t": 0.0, "still": True, "scale": 1.0, "viewer": 0, **more}
-        self.coordinator.send({"kind": "started", **started})
+        started = {
+            "frame": self.frame,
+            "view": VIEW,
+            "t": 0.0,
+            "still": True,
+            "scale": 1.0,
+            "viewer": 0,
+            "begun_at": 1.0,
+        }
+        self.coordinator.send({"kind": "started", **started, **more})
         self.display.send(picture(self.frame), payload)
         return self.frame
 
@@ -94,14 +106,19 @@ class FakeRun:
     def all(self, kind: str) -> list[dict[str, Any]]:
         return [message.header for message in list(self.heard) if message.kind == kind]
 
+    def last(self, kind: str, name: str) -> Any:
+        """A field of the last that rank 0 was told of a kind; None: nothing yet."""
+        told = self.all(kind)
+        return told[-1][name] if told else None
+
     def _listen(self) -> None:
         while not self._stop.is_set():
             self.heard += self.coordinator.receive(0.02)
 
 
 def picture(frame: int) -> dict[str, Any]:
-    size = {"width": 64, "height": 48, "encoding": "jpeg", "still": True, "scale": 1.0}
-    return {"kind": "picture", "frame": frame, **size, "parts_ms": {"render": 3.0}}
+    moments = {"composed_at": 1.003, "encoding_at": 1.004, "sent_at": 1.006}
+    return {"kind": "picture", "frame": frame, "width": 64, "height": 48, "encoding": "jpeg", **moments}
 
 
 def until(condition: Callable[[], bool], what: str, patience_s: float = 20.0) -> None:

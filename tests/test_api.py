@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 from splatpipe.cluster.api import open_config, open_scene
 from splatpipe.cluster.job import Job
+from splatpipe.nodes.raster.gl_context import gl_available
 from splatpipe.shared.build import BuildSettings, build_scene
 from splatpipe.shared.errors import ConfigError, InputError, SplatpipeError, StoreError
 from splatpipe.shared.synth import CityScan
@@ -195,6 +196,47 @@ def test_what_is_picked_is_in_the_picture(view):
         assert set(found["attributes"]) == {"index", "depth", *view.info.attributes}
     assert same >= 39
     assert view.pick(0, 0) is None
+
+
+@pytest.mark.gl
+@pytest.mark.skipif(not gl_available()[0], reason="no OpenGL")
+def test_with_opengl_points_are_on_the_device_once(scene):
+    with opened(scene, **{"render.rasterizer": "gl", "render.colour": "elevation"}) as view:
+        assert not view.keeps_sizes
+        first = view.render()
+        small = view.render(view.orbit(width=60, height=40))
+        assert len(view._stages) == 1
+        assert (np.ptp(small.reshape(-1, 4), axis=0) > 0).any()
+        assert np.array_equal(view.render(), first)
+        with opened(scene, **{"render.colour": "elevation"}) as other:
+            assert (view.render() != other.render()).any(axis=-1).mean() < 0.05
+
+
+@pytest.mark.parametrize(
+    ("build", "settings"),
+    [
+        ({"splats": True}, {"render.style": "splats"}),
+        ({"positions": "groups"}, {"render.positions": "coded"}),
+        ({"positions": "eci"}, {"render.point_size_px": 2}),
+        ({}, {"memory.residency": "paged", "memory.complete": True}),
+    ],
+    ids=["splats", "groups", "coded", "paged"],
+)
+def test_other_forms_of_points_are_drawn_and_picked(tmp_path, build, settings):
+    built = BuildSettings(points_per_cell=500, **build)
+    build_scene([CityScan(n_points=8_000)], tmp_path / "s", settings=built)
+    with opened(tmp_path / "s", **settings) as view:
+        picture = view.picture(layers=("rgba", "depth"))
+        rows, columns = np.nonzero(picture.depth)
+        assert len(rows) > 500
+        near = 0
+        for i in range(0, len(rows), len(rows) // 20):
+            found = view.pick(columns[i], rows[i])
+            near += found is not None and abs(found["attributes"]["depth"] - picture.depth[rows[i], columns[i]]) < 2
+        assert near >= 17
+        assert (view.render(view.orbit(90, 50, width=50, height=50)) != picture.rgba[0, 0]).any()
+        view.set({"render.colour": "elevation"})
+        assert (view.render() != picture.rgba).any()
 
 
 def test_no_thread_is_left(scene):

@@ -128,6 +128,11 @@ def folder(tmp_path_factory):
     return folder
 
 
+def test_costs_of_points_that_stay_on_disk(folder):
+    paged = ["memory.residency=paged", "memory.budget=1MB", "camera.width=64", "camera.height=36"]
+    assert measure_costs(Job(load_config(folder / "run.toml", paged)), 0.1) is not None
+
+
 def test_costs_measured_here(folder, monkeypatch):
     from splatpipe.cluster.live import expected as module
 

@@ -3,6 +3,8 @@
 import io
 import json
 import random
+import subprocess
+import sys
 import threading
 import time
 from contextlib import contextmanager
@@ -11,7 +13,7 @@ import pytest
 from rich.console import Console
 from splatpipe.cluster.job import Job
 from splatpipe.cluster.live import monitor
-from splatpipe.cluster.live.board import HISTORY, MAX_SERIES, Board, text
+from splatpipe.cluster.live.board import HISTORY, MAX_SERIES, MAX_VALUES, Board, text
 from splatpipe.cluster.live.monitor import monitor_command
 from splatpipe.cluster.live.protocol import MAX_HEADER_BYTES
 from splatpipe.cluster.live.replay import replayed
@@ -76,7 +78,7 @@ def shown(board, width, colours=False):
 def say(target, *, terminal=False, width=100, **options):
     """What the command prints, but for JSON."""
     out = io.StringIO()
-    console = Console(file=out, width=width, force_terminal=terminal, highlight=False, soft_wrap=True)
+    console = Console(file=out, width=width, force_terminal=terminal, highlight=False)
     assert monitor_command(target, console=console, **options) == 0
     return out.getvalue()
 
@@ -128,6 +130,20 @@ def test_nothing_grows_with_time():
         board.hear(welcome())
     assert len(board.rate) == HISTORY == max(map(len, board.series.values()))
     assert len(board.ranks) == 4
+
+
+def test_a_run_that_rests_shows_the_times_that_it_had():
+    resting = metrics(9, rate=0.0)
+    for of in resting["ranks"]:
+        of["values"] = {name: value for name, value in of["values"].items() if not name.endswith("_ms")}
+    said = shown(board_of([*recorded(), resting]), 100)
+    assert "at rest" in said
+    assert "2  render    render    39.0 ms  3.00 ms    20.0 ms   1.95" in said
+    board = Board()
+    for i in range(1000):
+        values = {f"stage{i}.{j}_ms": 1.0 for j in range(96)}
+        board.hear({"kind": "metrics", "t": i, "ranks": [{"rank": 0, "values": values}]})
+    assert len(board.ranks[0].values) == MAX_VALUES
 
 
 def test_text_moves_no_cursor():
@@ -315,7 +331,8 @@ GOOD = json.dumps(metrics(0)).encode()
         (lines_of(GOOD, b"{", GOOD), "line 2: header: expected JSON"),
         (lines_of(GOOD, b"{"), "line 2: header: expected JSON"),
         (lines_of(GOOD, b'{"kind": "metrics", "t": NaN, "ranks": []}'), "line 2: header: expected JSON"),
-        (lines_of(GOOD, b'{"kind": "metrics", "t": 1e999, "ranks": []}'), "line 2: metrics.t: expected finite"),
+        (lines_of(GOOD, b'{"kind": "metrics", "t": 1e999, "ranks": []}'), "line 2: header: expected JSON"),
+        (lines_of(GOOD, b'{"kind": "metrics", "t": "1", "ranks": []}'), "line 2: metrics.t: expected finite"),
         (lines_of(GOOD, b'{"kind": "metrics", "t": 1, "ranks": 7}'), "line 2: metrics.ranks: expected a list"),
         (lines_of(GOOD, b"[" * 60_000), "line 2: header: expected"),
         (lines_of(GOOD, b"[7]"), "line 2: header: expected a JSON object"),
@@ -403,6 +420,9 @@ class NoServices:
     def left_out(self):
         return []
 
+    def expected(self, ranks, counts):
+        return []
+
 
 @contextmanager
 def live_run(tmp_path, messages, every_s=0.05):
@@ -469,6 +489,16 @@ def test_a_run_that_ends_is_said(tmp_path, monkeypatch):
 def test_a_monitor_connects_anew(tmp_path, monkeypatch):
     monkeypatch.setattr(monitor, "RECONNECT_TICKS", 1)
     with live_run(tmp_path, of_ranks(metrics(0))) as hub:
+        from splatpipe.cluster.live import sockets
+
+        clients = []
+
+        class Client(sockets.Client):
+            def __init__(self, *arguments, **options):
+                super().__init__(*arguments, **options)
+                clients.append(self)
+
+        monkeypatch.setattr(sockets, "Client", Client)
         source = monitor.LiveRun(hub.connection)
         messages = source.messages()
         kinds = []
@@ -476,8 +506,7 @@ def test_a_monitor_connects_anew(tmp_path, monkeypatch):
             kinds.append(header["kind"] if header else None)
             if kinds.count("metrics") == 1 and "bye" not in kinds:
                 kinds.append("bye")
-                for viewer in list(hub._viewers.values()):  # as one that takes nothing
-                    hub._loop.call_soon_threadsafe(hub._drop, viewer, "takes nothing")
+                clients[0].send({"kind": "nonsense"})  # for which the hub drops it
             if kinds.count("welcome") == 2 or len(kinds) > 300:
                 break
         assert source.state == "live"
@@ -497,3 +526,17 @@ def test_no_run_and_no_answer(tmp_path, monkeypatch):
         monkeypatch.setattr(monitor, "PATIENCE_S", 0.3)
         with pytest.raises(SplatpipeError, match=r"127.0.0.1:9: no answer in 0.3 s"):
             say(wrong, once=True)
+
+
+def test_a_recording_takes_neither_sockets_nor_compiled_kernels(tmp_path):
+    path = record(tmp_path / "run.jsonl", recorded())
+    code = f"""
+import sys
+from pathlib import Path
+from splatpipe.cluster.live.monitor import monitor_command
+monitor_command(Path({str(path)!r}), once=True)
+print({{"zmq", "aiohttp", "numba", "mpi4py", "scipy"}} & set(sys.modules))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == "set()"

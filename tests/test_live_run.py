@@ -18,6 +18,7 @@ from splatpipe.cluster.live.view import live_config
 from splatpipe.cluster.live.views import camera_of
 from splatpipe.cluster.pipeline import FrameLoop
 from splatpipe.cluster.topologies import layout_of
+from splatpipe.nodes.raster.gl_context import gl_available
 from splatpipe.shared.build import BuildSettings, build_scene
 from splatpipe.shared.config import load_config
 from splatpipe.shared.errors import ConfigError
@@ -33,6 +34,17 @@ def scene(tmp_path_factory):
     path = tmp_path_factory.mktemp("live") / "scene"
     build_scene([CityScan(n_points=20_011)], path, settings=BuildSettings(points_per_cell=300))
     return path
+
+
+@pytest.fixture(scope="module")
+def forms(tmp_path_factory):
+    """The city with whatever a run may want of a scene."""
+    folder = tmp_path_factory.mktemp("forms")
+    city = [CityScan(n_points=20_011)]
+    build_scene(city, folder / "splats", settings=BuildSettings(points_per_cell=300, splats=True, features=True))
+    build_scene(city, folder / "groups", settings=BuildSettings(points_per_cell=300, positions="groups"))
+    build_scene(city, folder / "pools", settings=BuildSettings(points_per_cell=300, pools=True))
+    return folder
 
 
 @pytest.fixture
@@ -138,9 +150,9 @@ def live(config, sets, topology, ranks, script):
     return hub
 
 
-def reference(config, view, settings=None, size=None):
+def reference(config, view, settings=None, size=None, sets=()):
     """(h, w, 3) uint8 of one rank with these settings, without anything that is live."""
-    given = live_config(load_config(config))
+    given = live_config(load_config(config, list(sets)))
     job = Job(configured(given, settings or {}))
     if size:
         job = Job(configured(given, (settings or {}) | dict(zip(SIZE, size, strict=True))))
@@ -228,12 +240,54 @@ def test_a_slow_run_draws_smaller_pictures_while_the_camera_moves(config):
     live(config, ["live.fps=240", "render.supersampling=8", "live.least_scale=0.2"], "pipelined", 3, script)
 
 
+@pytest.mark.parametrize(
+    "sets",
+    [
+        ["render.positions=compact"],
+        ["render.positions=coded"],
+        ["render.style=splats"],
+        ["render.style=splats", "splats.features=true"],
+        ["render.point_size_adaptive=true"],
+        ["memory.residency=paged", "memory.budget=1MB", "memory.complete=true"],
+        ["sampling.pools=bytes"],
+        pytest.param(["render.rasterizer=gl"], marks=pytest.mark.gl),
+    ],
+    ids=lambda sets: " ".join(sets),
+)
+def test_points_in_every_form_follow_settings(forms, config, sets):
+    """Colours, filters and sizes, each changed after the other."""
+    if "render.rasterizer=gl" in sets and not gl_available()[0]:
+        pytest.skip("no OpenGL 4.5 device")
+    of = "groups" if "render.positions=coded" in sets else "pools" if "sampling.pools=bytes" in sets else "splats"
+    sets = [*sets, f"scene.path={forms / of}"]
+    changes = [{"render.colour": "elevation"}, {"camera.width": 120}, {"render.background": "#ffffff"}]
+    changes += [{"filter.boxes": [{"lower": [0, 0, 0], "upper": [120, 90, 90]}]}] * (of == "splats")
+    changes += [{"render.edl_strength": 0.3}, {"render.colour": None}]
+
+    def script(hub):
+        hub.tell(kind="viewers", pictures=1)
+        _, _, after = hub.still()
+        hub.look(VIEW)
+        settings = {}
+        for change in changes:
+            hub.tell(kind="settings", set=change, viewer=1, request=7)
+            settings = {k: v for k, v in (settings | change).items() if v is not None}
+            hub.wait(lambda m: m.kind in ("settings", "refused"), after)
+            started, picture, after = hub.still(after)
+            while started["view"]["eye"] != VIEW["eye"]:
+                started, picture, after = hub.still(after)
+            assert np.array_equal(picture, reference(config, VIEW, settings, sets=sets)), settings
+
+    hub = live(config, sets, "pipelined", 3, script)
+    assert not [m.header for m in hub.said if m.kind == "refused"]
+
+
 @pytest.mark.parametrize(("topology", "ranks"), [("single", 1), ("pipelined", 3), ("sort-first", 4)])
 def test_a_screenshot_has_its_own_size_and_leaves_the_pictures_as_they_are(config, topology, ranks):
     def script(hub):
         hub.tell(kind="viewers", pictures=1)
         hub.look(LOW)
-        _, before, after = hub.still()
+        _, _, after = hub.still()
         hub.tell(kind="screenshot", viewer=4, request=9, width=321, height=203)
         shot, _ = hub.wait(lambda m: m.kind == "screenshot")
         started, _ = hub.wait(lambda m: m.kind == "started" and m.header["frame"] == shot.header["frame"])
@@ -269,7 +323,7 @@ def test_what_cannot_be_drawn_is_refused_to_who_asked_and_changes_nothing(config
             assert "\n" not in refused.header["why"]
         _, after = hub.wait(lambda m: m.kind == "started" and m.header["view"]["eye"] == VIEW["eye"])
         hub.look(LOW)
-        started, picture, after = hub.still(after)
+        _, picture, _ = hub.still(after)
         assert np.array_equal(picture, reference(config, LOW))
 
     live(config, [], "single", 1, script)

@@ -1,7 +1,9 @@
 """What is answered beside a live run: picks as the run draws, recorded paths that run, and what is left out."""
 
+import io
 import json
 import math
+import signal
 import subprocess
 import sys
 import tomllib
@@ -281,3 +283,61 @@ def test_what_is_left_out_is_what_the_plan_says(scene, tmp_path):
     )
     assert {"MPI", "layers", "clip boxes"} <= {part["what"] for part in told}
     assert json.dumps(told)
+
+
+def test_of_three_ranks_mpi_is_not_left_out(scene):
+    told = RunServices(config_of(scene, **{"pipeline.topology": "pipelined"})).left_out()
+    assert "MPI" not in {part["what"] for part in told}
+
+
+# --- in a live run ----------------------------------------------------------------------------------------------------
+
+
+def test_a_live_run_answers_its_viewers(scene, tmp_path):
+    pytest.importorskip("zmq", reason="pyzmq is missing: splatpipe[live]")
+    pytest.importorskip("aiohttp", reason="aiohttp is missing: splatpipe[live]")
+    from splatpipe.cluster.live.sockets import Client
+
+    config = config_of(scene, **{"camera.width": 160, "camera.height": 96})
+    tables = config.model_dump(mode="json", exclude_defaults=True)
+    (tmp_path / "live.toml").write_text(toml_document(tables))
+    connection = tmp_path / "connection.json"
+    command = [sys.executable, "-m", "splatpipe.cluster", "view", "live.toml", "--connection", str(connection)]
+    run = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    try:
+        assert "look at it" in run.stdout.readline()
+        with Client(connection, pictures=True) as client:
+
+            def ask(kind, **fields):
+                client.send({"kind": kind, **fields})
+                return heard(kind)
+
+            def heard(kind):
+                for _ in range(300):
+                    message = client.receive(0.1)
+                    if message is not None and message.kind in (kind, "refused", "bye"):
+                        assert message.kind == kind, message.header
+                        return message
+                raise AssertionError(f"no {kind}")
+
+            welcome = heard("welcome").header
+            picture = heard("picture")
+            rgb = np.asarray(Image.open(io.BytesIO(picture.payload)).convert("RGB"))
+            rows, columns = np.nonzero((rgb != 255).any(axis=2))
+            i = len(rows) // 2
+            at = {"x": (columns[i] + 0.5) / 160, "y": (rows[i] + 0.5) / 96}
+            picked = ask("pick", request=3, frame=picture.header["frame"], **at).header
+            assert (picked["request"], picked["found"]) == (3, True)
+            assert picked["attributes"]["rgb"] == rgb[rows[i], columns[i]].tolist()
+            key = {"view": welcome["view"]}
+            asked = {"keys": [{"time": 0, **key}, {"time": 1, **key}], "fps": 12}
+            toml = tomllib.loads(ask("path", request=4, **asked).header["toml"])
+            assert (toml["output"]["frames"], toml["scene"]["path"]) == (12, str(scene))
+            assert ask("plan", request=5).header["left_out"][0]["what"] == "MPI"
+
+        run.send_signal(signal.SIGINT)
+        assert run.wait(30) == 0, run.stdout.read()
+    finally:
+        run.kill()
+        run.wait()
+        run.stdout.close()

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from splatpipe.shared.build import BuildSettings, build_scene
 from splatpipe.shared.synth import CityScan, write_las
 
 ROOT = Path(__file__).parent.parent
@@ -31,6 +32,19 @@ def test_the_commands_for_ones_own_file_work_in_order(tmp_path):
         assert done.returncode == 0, (line, done.stderr)
     assert (tmp_path / "frames" / "frame_0001.png").exists()
     assert (tmp_path / "frames" / "film.mp4").exists()
+
+
+def test_its_python_runs(tmp_path):
+    blocks = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    if not blocks:
+        pytest.skip("there is none")
+    source = CityScan(n_points=20_000)
+    build_scene([source], tmp_path / "survey.scene", settings=BuildSettings(points_per_cell=1000))
+    for block in (block for block in blocks if "open_scene" in block):
+        done = subprocess.run(
+            [sys.executable, "-c", block], cwd=tmp_path, capture_output=True, text=True, timeout=100, check=False
+        )
+        assert done.returncode == 0, (block, done.stderr)
 
 
 def test_files_and_pictures_it_links_to_are_there():

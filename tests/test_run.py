@@ -140,7 +140,8 @@ def test_one_rank_imports_neither_mpi_nor_opengl_nor_what_it_does_not_write(conf
     program = (
         "import sys\nfrom splatpipe.cluster.cli import app\n"
         "try:\n    app(sys.argv[1:])\nexcept SystemExit as end:\n    assert not end.code, end.code\n"
-        "heavy = ('mpi4py', 'moderngl', 'zmq', 'av', 'vtk', 'matplotlib', 'laspy', 'plyfile', 'pye57', "
+        "heavy = ('mpi4py', 'moderngl', 'zmq', 'aiohttp', 'jupyter_rfb', 'splatpipe.cluster.live', 'av', 'vtk', "
+        "'matplotlib', 'laspy', 'plyfile', 'pye57', "
         "'splatpipe.nodes.raster.paged', 'splatpipe.nodes.page_reader')\n"
         "print('imported', [name for name in heavy if name in sys.modules])\n"
     )
@@ -149,6 +150,20 @@ def test_one_rank_imports_neither_mpi_nor_opengl_nor_what_it_does_not_write(conf
     done = call(sys.executable, "-c", program, *arguments)
     assert done.returncode == 0, done.stderr
     assert done.stdout.endswith("imported []\n"), done.stdout
+
+
+@needs_mpi
+@pytest.mark.mpi
+def test_no_rank_imports_what_only_a_live_run_needs(config, tmp_path):
+    done = call(
+        *command(config, tmp_path / "out", **{"pipeline.topology": "pipelined"}),
+        env=os.environ | {"PYTHONPROFILEIMPORTTIME": "1"},
+    )
+    assert done.returncode == 0
+    imported = {line.rpartition("|")[2].strip().split(".")[0] for line in done.stderr.splitlines()}
+    assert "mpi4py" in imported
+    assert not imported & {"zmq", "aiohttp", "jupyter_rfb"}
+    assert "splatpipe.cluster.live" not in done.stderr
 
 
 @needs_mpi

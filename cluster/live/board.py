@@ -118,8 +118,10 @@ class Board:
         for of in found:
             state = self.ranks.setdefault(of.rank, of)
             state.role, state.host = of.role or state.role, of.host or state.host
-            if kind == "values":
-                state.values = of.values
+            if kind == "values":  # a rank that rests, or a hub that nobody answers, says no times: the last ones hold
+                held = state.values.items() if state is not of else ()
+                times = [(name, value) for name, value in held if name.endswith("_ms") and name not in of.values]
+                state.values = dict(times[: MAX_VALUES - len(of.values)]) | of.values
             else:
                 state.values, state.predicted = (state.values if state is not of else {}), of.values
 

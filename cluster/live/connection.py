@@ -71,7 +71,8 @@ class Connection:
                 json.dump(asdict(self), stream)
             part.replace(path)
         except OSError as error:
-            part.unlink(missing_ok=True)
+            with suppress(OSError):  # as where there is no such folder
+                part.unlink(missing_ok=True)
             raise InputError(f"{path}: cannot write the connection file: {error.strerror}") from None
 
     @classmethod
@@ -117,8 +118,8 @@ def runtime_directory() -> Path:
     """Where connection files are, made if need be: ``$XDG_RUNTIME_DIR/splatpipe``, or ``splatpipe-UID`` among temporary
     files. Raises InputError where it is another user's or open to others.
     """
-    base = os.environ.get("XDG_RUNTIME_DIR", "")
-    path = Path(base) / "splatpipe" if base else Path(tempfile.gettempdir()) / f"splatpipe-{os.getuid()}"
+    base = Path(os.environ.get("XDG_RUNTIME_DIR") or "/dev/null")
+    path = base / "splatpipe" if base.is_dir() else Path(tempfile.gettempdir()) / f"splatpipe-{os.getuid()}"
     try:
         with suppress(FileExistsError):
             path.mkdir(mode=0o700)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from ...shared.config import LiveSection
 from ...shared.errors import SplatpipeError
 from ...shared.messages import FrameStart, Kind, Use
 from ...shared.windows import tiles
@@ -49,7 +50,7 @@ class LiveCoordinator:
         self._near = job.camera(0).near
         camera = job.config.camera
         view = view_of(job)
-        self._steering = Steering(view, (camera.width, camera.height), job.config.live)
+        self._steering = Steering(view, (camera.width, camera.height), self._kept(job.config.live))
         self._ready: deque[FrameStart] = deque()
         self._under_way: deque[tuple[Use, float]] = deque()
         self._frame = 0
@@ -208,8 +209,12 @@ class LiveCoordinator:
         settings = changed(self._steering.settings, wanted)
         config = configured(self._job.config, settings)
         self._job.with_config(config)  # refuses what does not suit the scene
-        self._steering.set(settings, (config.camera.width, config.camera.height), config.live, viewer, now)
+        self._steering.set(settings, (config.camera.width, config.camera.height), self._kept(config.live), viewer, now)
         self._link.send({"kind": "settings", "settings": settings_of(config)})
+
+    def _kept(self, live: LiveSection) -> LiveSection:
+        """With no smaller pictures where their size would cost more than it saves."""
+        return live if self._job.resizes else live.model_copy(update={"least_scale": 1.0})
 
     def _shoot(self, said: Mapping[str, Any]) -> None:
         if said["width"] * said["height"] > MAX_SCREENSHOT_PIXELS:

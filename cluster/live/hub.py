@@ -17,7 +17,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from ...shared.errors import MessageError, SplatpipeError
+from ...shared.errors import InputError, MessageError, SplatpipeError
 from ..record import package_version
 from .asked import Services
 from .connection import Connection, RunAddress
@@ -112,21 +112,22 @@ class Hub:
             record = Record(self._record_path) if self._record_path is not None else None
             if record is not None:
                 stack.callback(record.close)
-            self._sockets = HubSockets(self._bind, self._zmq_port, server, run[0], viewer[0])
+            address = _number_of(self._bind)
+            self._sockets = HubSockets(address, self._zmq_port, server, run[0], viewer[0])
             stack.callback(self._sockets.close)
             write = record.write if record is not None else lambda header: None
             version = package_version("splatpipe") or ""
             self._board = board = Switchboard(self._services, self._to_run, write, version, socket.gethostname())
             stack.callback(board.close_worker)
-            site = Site(self._bind, token, board.connect, board.hear, board.leave)
+            site = Site(self._bind, address, token, board.connect, board.hear, board.leave)
             await site.start(self._port)
             stack.push_async_callback(site.close)
 
             host = _name_of(self._bind)
             self.url = f"http://{host}:{site.port}/?token={token}"
             self.run_address = RunAddress(f"tcp://{host}:{self._sockets.run.port}", server[0], *run)
-            address = f"tcp://{host}:{self._sockets.viewers.port}"
-            connection = Connection(PROTOCOL_VERSION, address, server[0], *viewer, self.url, os.getpid())
+            programs_at = f"tcp://{host}:{self._sockets.viewers.port}"
+            connection = Connection(PROTOCOL_VERSION, programs_at, server[0], *viewer, self.url, os.getpid())
             connection.write(self.connection)
             programs = Programs(self._sockets.viewers, board.connect, board.hear, board.leave)
             work = {
@@ -173,6 +174,13 @@ class Hub:
             return self._sockets.run.send(self._coordinator, to_json(header))
         except Gone:
             return False
+
+
+def _number_of(bind: str) -> str:
+    try:
+        return str(socket.getaddrinfo(bind, None, type=socket.SOCK_STREAM)[0][4][0])
+    except (OSError, UnicodeError):
+        raise InputError(f"--bind {bind}: expected an address or a name of this host") from None
 
 
 def _name_of(bind: str) -> str:

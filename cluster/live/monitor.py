@@ -51,7 +51,7 @@ def monitor_command(
     speed : of a replay; None: as recorded on a terminal, at once elsewhere.  at : seconds of the run to begin with.
     Raises InputError for a file that is none of these, SplatpipeError where a run does not answer.
     """
-    console = console or Console(highlight=False, soft_wrap=True)
+    console = console or Console(highlight=False)
     on_terminal = console.is_terminal and not (once or as_json)
     board = Board(shows)
     source: LiveRun | Replay
@@ -221,7 +221,7 @@ def _take_snapshot(messages: Messages, board: Board, *, live: bool) -> None:
 
 
 def _print_screen(console: Console, board: Board, state: str) -> None:
-    console.print(screen(board, console.width, state), soft_wrap=False)
+    console.print(screen(board, console.width, state))
 
 
 def _print_lines(messages: Messages, board: Board, console: Console) -> None:
@@ -229,9 +229,9 @@ def _print_lines(messages: Messages, board: Board, console: Console) -> None:
         if header is None or not _hear(board, header):
             continue
         if header["kind"] == "metrics":
-            console.print(line(board), markup=False)
+            console.print(line(board), markup=False, soft_wrap=True)
         elif board.ended:
-            console.print(board.ended, markup=False)
+            console.print(board.ended, markup=False, soft_wrap=True)
             return
 
 

@@ -102,7 +102,8 @@ class Programs:
             return
         with suppress(ConnectionError):
             self.send(peer, last)
-        self._deaf_until[peer] = time.monotonic() + DEAF_S
+        now = time.monotonic()
+        self._deaf_until[peer] = now + DEAF_S
         self._deaf_until.move_to_end(peer)
-        while len(self._deaf_until) > _MAX_DEAF:
+        while len(self._deaf_until) > _MAX_DEAF or next(iter(self._deaf_until.values())) < now:
             self._deaf_until.popitem(last=False)

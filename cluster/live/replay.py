@@ -135,7 +135,7 @@ def run_messages(record: dict[str, Any]) -> Iterator[dict[str, Any]]:
                 values[having[stage]][f"{stage}.wait_ms"] = waits_ms[stage]
         for name, (stage, called) in _COUNTS.items():
             if name in lists and len(lists[name][part]):
-                values[having.get(stage, ranks[0]["rank"])][called] = float(lists[name][part].mean())
+                values[having[stage] if stage in having else ranks[0]["rank"]][called] = float(lists[name][part].mean())
         if "missing" in lists and len(lists["missing"][part]):
             values[having["render"]]["missing"] = float(lists["missing"][part].mean())
         for of in record["ranks"]:

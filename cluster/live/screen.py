@@ -15,6 +15,8 @@ from .board import Board, RankState
 
 OFF = 0.3
 """Share by which measured and predicted may differ before it is shown in colour."""
+OFF_MS = 0.5
+"""What is off by less is no news: a rank that wakes up takes as long."""
 WIDE = 110
 """Columns from which on hosts, and all values of a rank, have room."""
 MOST_ROWS = 64
@@ -142,8 +144,8 @@ def _figures(board: Board, width: int) -> RenderableType:
     out = Text()
     rate = board.frames_per_s
     if rate is not None:
-        out.append(f"{rate:.1f}", style="bold")
-        out.append(f" frames/s{_expected_rate(board)} ")
+        out.append(f"{rate:.1f}" if rate else "at rest", style="bold")
+        out.append(f" frames/s{_expected_rate(board)} " if rate else " ")
         out.append(sparkline(board.rate, min(24, width // 4)), style="cyan")
     for name, value in _summary(board):
         out.append("   " if out else "")
@@ -177,7 +179,7 @@ def _stage_table(ranks: Sequence[RankState], width: int) -> Table:
             Text(amount("_ms", wait), style="dim"),
             amount("_ms", predicted) if predicted is not None else "–",
             _ratio(work, predicted),
-            Bar(work, wait, most, _style(work, predicted) or "cyan"),
+            Bar(work, wait, most, _style(work, predicted, OFF_MS) or "cyan"),
         )
         before = of
     return table
@@ -264,12 +266,12 @@ def _expected_rate(board: Board) -> str:
 def _ratio(measured: float, predicted: float | None) -> Text:
     if not predicted or predicted <= 0:
         return Text("–", style="dim")
-    return Text(f"{min(measured / predicted, 999.99):.2f}", style=_style(measured, predicted))
+    return Text(f"{min(measured / predicted, 999.99):.2f}", style=_style(measured, predicted, OFF_MS))
 
 
-def _style(measured: float, predicted: float | None) -> str:
-    """Colour of a time that is further off than ``OFF``."""
-    if not predicted or predicted <= 0:
+def _style(measured: float, predicted: float | None, least: float = 0.0) -> str:
+    """Colour of a value that is further off than ``OFF``, and than ``least``."""
+    if not predicted or predicted <= 0 or abs(measured - predicted) <= least:
         return ""
     if measured > predicted * (1 + OFF):
         return "bold red"

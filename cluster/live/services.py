@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import json
 import threading
+from contextlib import suppress
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from ...shared.config import RunConfig
+from ...shared.errors import SplatpipeError
 from .protocol import PathKey, View
 from .settings import configured
 from .views import camera_of
@@ -57,24 +59,38 @@ class RunServices:
 
         Cost: at the first call, that of culling and sampling some frames.
         """
+        from ..launch import mpi_available
         from ..plan.needs import left_out
-        from ..plan.topology import decide
+        from ..plan.topology import Decision, decide
         from ..plan.workload import Workload
 
         with self._lock:
             if self._left_out is None:
-                job = self._job
-                parts = left_out(job, Workload.of_look(job), decide(job))
+                job, chain = self._job, "a live run takes three ranks where there is MPI"
+                is_chain = self._config.pipeline.topology == "auto" and mpi_available()
+                decision = Decision("pipelined", chain) if is_chain else decide(job)
+                parts = left_out(job, Workload.of_look(job), decision)
                 self._left_out = [
                     {"what": part["what"], "why": part["why"], "saves": _saves(part["gain"], part["unit"])}
                     for part in parts
                 ]
             return self._left_out
 
+    def measure(self) -> None:
+        """Measure what the model needs; to be called before the ranks have the cores. Without kernels that have been
+        compiled it is left to the first question, and what is wrong with the scene to the ranks.  Cost: 1.5 s.
+        """
+        from ...nodes.raster.cpu import kernels_cached
+
+        job = self._job
+        if job.rasterizer == "cpu" and kernels_cached(pools=job.wanted.pools, groups=job.coded, paged=job.paged):
+            with suppress(SplatpipeError):
+                _ = self._costs
+
     def expected(self, ranks: int, counts: dict[str, float]) -> list[dict[str, Any]]:
         """What the performance model expects of a frame with these counts (``expected``).
 
-        Cost: at the first call, some seconds of measuring, while the run goes on.
+        Cost: some ms; where ``measure`` was not called, some seconds at the first call.
         """
         from .expected import expected, setting_of
 

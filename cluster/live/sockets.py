@@ -33,6 +33,7 @@ __all__ = ["Client", "Gone", "HubSockets", "Router", "RunAddress", "RunLink", "n
 _CURVE_BYTES = 64
 """By which CURVE lengthens a frame, and some."""
 _RANK_WAITING = 64
+_CLIENT_WAITING = 1000
 _VIEWER_WAITING = 16
 """Messages that may wait in a socket for one peer."""
 _HEARTBEAT_MS = 5_000
@@ -61,7 +62,7 @@ class RunLink:
 
     def __init__(self, address: RunAddress, rank: int, role: str, host: str) -> None:
         self._context = zmq.Context()
-        self._socket = _dealer(self._context, address.address, address, MAX_HEADER_BYTES)
+        self._socket = _dealer(self._context, address.address, address, MAX_HEADER_BYTES, _RANK_WAITING)
         self._socket.setsockopt(zmq.LINGER, _RANK_LINGER_MS)
         self._socket.setsockopt(zmq.ROUTING_ID, f"rank{rank}".encode())
         self._lock = threading.Lock()
@@ -162,7 +163,7 @@ class Client:
         found = connection if isinstance(connection, Connection) else find_connection(connection)
         self.connection = found
         self._context = zmq.Context()
-        self._socket = _dealer(self._context, found.address, found, MAX_PAYLOAD_BYTES)
+        self._socket = _dealer(self._context, found.address, found, MAX_PAYLOAD_BYTES, _CLIENT_WAITING)
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.connect(found.address)
         wanted = {"pictures": pictures, "metrics": metrics}
@@ -202,7 +203,9 @@ class Client:
         self.close()
 
 
-def _dealer(context: zmq.Context[Any], address: str, keys: RunAddress | Connection, max_bytes: int) -> Any:
+def _dealer(
+    context: zmq.Context[Any], address: str, keys: RunAddress | Connection, max_bytes: int, waiting: int
+) -> Any:
     socket = context.socket(zmq.DEALER)
     try:
         socket.setsockopt(zmq.CURVE_SERVERKEY, keys.server_key.encode())
@@ -213,7 +216,7 @@ def _dealer(context: zmq.Context[Any], address: str, keys: RunAddress | Connecti
         context.term()
         raise InputError(f"{address}: the keys of this connection are no CURVE keys") from None
     socket.setsockopt(zmq.MAXMSGSIZE, max_bytes + _CURVE_BYTES)
-    socket.setsockopt(zmq.SNDHWM, _RANK_WAITING)
+    socket.setsockopt(zmq.SNDHWM, waiting)
     socket.setsockopt(zmq.RCVHWM, _RANK_WAITING)
     socket.setsockopt(zmq.TCP_KEEPALIVE, 1)
     return socket

@@ -28,7 +28,7 @@ from .protocol import (
     ViewerMessage,
     said_by_viewer,
 )
-from .viewers import HELLO_S, MESSAGES_PER_S, Outlet, Parcel, Viewer
+from .viewers import CAMERAS_PER_S, FLOOD_PER_S, HELLO_S, MESSAGES_PER_S, Outlet, Parcel, Viewer
 
 MAX_VIEWERS = 256
 MAX_SCREENSHOTS_EACH = 2
@@ -65,7 +65,9 @@ class Switchboard:
         self._ready_at = self._told_at = 0.0
         self._settings: dict[str, Any] = {}
         self._frames: OrderedDict[int, dict[str, Any]] = OrderedDict()  # frame → its "started"
-        self._early: OrderedDict[int, tuple[dict[str, Any], bytes]] = OrderedDict()  # what came before its "started"
+        self._early: OrderedDict[tuple[str, int], tuple[dict[str, Any], bytes]] = (
+            OrderedDict()
+        )  # before their "started"
         self._picture: Parcel | None = None
         self._prediction: Parcel | None = None
         self._shown = self._shown_told = -1
@@ -106,12 +108,11 @@ class Switchboard:
             raise MessageError(f"{header['kind'][:40]}: not understood ({type(error).__name__})") from error
 
     def _hear(self, viewer: Viewer, header: dict[str, Any]) -> None:
-        moved = header["kind"] == "camera"
-        if not viewer.messages.take():
-            if not moved or not viewer.cameras.take():
-                raise MessageError(f"found more than {MESSAGES_PER_S:g} messages a second")
-            viewer.late_camera = header
+        if header["kind"] == "camera" and not viewer.cameras.take():
+            self._put_off(viewer, header)
             return
+        if header["kind"] != "camera" and not viewer.messages.take():
+            raise MessageError(f"found more than {MESSAGES_PER_S:g} messages a second")
         message = said_by_viewer(header)
         if viewer.hello is None:
             self._greet(viewer, message)
@@ -171,6 +172,22 @@ class Switchboard:
         told = n == self._n_watching or self._ready is None or self._closed
         if not told and self._to_run({"kind": "viewers", "pictures": n}):
             self._n_watching = n
+
+    def _put_off(self, viewer: Viewer, header: dict[str, Any]) -> None:
+        """A camera above what is allowed: heard a little later, unless there is another by then."""
+        if not viewer.flood.take():
+            raise MessageError(f"found more than {FLOOD_PER_S:g} cameras a second")
+        if viewer.late_camera is None:
+            asyncio.get_running_loop().call_later(1 / CAMERAS_PER_S, self._hear_late, viewer)
+        viewer.late_camera = header
+
+    def _hear_late(self, viewer: Viewer) -> None:
+        late, viewer.late_camera = viewer.late_camera, None
+        if late is not None:
+            try:
+                self.hear(viewer, late)
+            except MessageError as error:
+                self.leave(viewer, str(error))
 
     def _move(self, viewer: Viewer, moved: CameraMoved) -> None:
         if self._ready is None:
@@ -252,14 +269,15 @@ class Switchboard:
         self._frames[frame] = header
         while len(self._frames) > FRAMES_KNOWN:
             self._frames.popitem(last=False)
-        if frame in self._early:
-            self.from_run(*self._early.pop(frame))
+        for kind in ("picture", "screenshot"):
+            if (kind, frame) in self._early:
+                self.from_run(*self._early.pop((kind, frame)))
 
     def _started(self, header: dict[str, Any], payload: bytes) -> dict[str, Any] | None:
         """What rank 0 said of a frame; None: it comes from another rank and is still to come, and this waits for it."""
         started = self._frames.get(header["frame"])
         if started is None:
-            self._early[header["frame"]] = header, payload
+            self._early[header["kind"], header["frame"]] = header, payload
             while len(self._early) > 2:
                 self._early.popitem(last=False)
         return started
@@ -270,7 +288,7 @@ class Switchboard:
             return
         started.update(width=header["width"], height=header["height"])
         sent = {name: header[name] for name in ("kind", "frame", "width", "height", "encoding")}
-        begun = {name: started[name] for name in ("view", "t", "viewer", "still", "scale")}
+        begun = {name: started.get(name) for name in ("view", "t", "viewer", "still", "scale")}
         self._picture = Parcel({**sent, **begun, "parts_ms": _parts_ms(started, header)}, payload)
         for viewer in self._viewers.values():
             if viewer.welcomed and viewer.pictures:
@@ -321,10 +339,7 @@ class Switchboard:
         """To be called a few times a second: drops who does not do his part, and tells metrics."""
         now = time.monotonic()
         for viewer in list(self._viewers.values()):
-            try:
-                self._look_after(viewer, now)
-            except MessageError as error:
-                self.leave(viewer, str(error))
+            self._look_after(viewer, now)
         self._send_camera()
         self._tell_shown()
         self._count()
@@ -356,9 +371,6 @@ class Switchboard:
         elif viewer.stalled(now):
             self.leave(viewer, "takes nothing")
         else:
-            late, viewer.late_camera = viewer.late_camera, None
-            if late is not None:
-                self.hear(viewer, late)
             if viewer.welcomed and now - viewer.sent_at > PROBE_S and viewer.outlet.probed:
                 viewer.latest(Parcel({"kind": "settings", "settings": self._settings}))
             for request in [request for request, at in viewer.screenshots.items() if now - at > SCREENSHOT_S]:
@@ -382,18 +394,21 @@ class Switchboard:
 
 
 def _parts_ms(started: dict[str, Any], picture: dict[str, Any]) -> dict[str, float]:
-    """Where the time went from a camera's arrival here to that of its picture; clocks are those of one host."""
+    """Where the time went from a camera's arrival here to that of its picture; clocks are those of one host.
+
+    A moment that nobody has told, such as that of a picture that no camera has asked for, belongs to no part.
+    """
     moments = {
-        "to_run": started["asked_at"],
-        "waiting": started["begun_at"],
-        "drawing": picture["composed_at"],
-        "queued": picture["encoding_at"],
-        "encoding": picture["sent_at"],
+        "to_run": started.get("asked_at"),
+        "waiting": started.get("begun_at"),
+        "drawing": picture.get("composed_at"),
+        "queued": picture.get("encoding_at"),
+        "encoding": picture.get("sent_at"),
         "to_hub": time.monotonic(),
     }
-    parts, before = {}, started["camera_at"]
+    parts, before = {}, started.get("camera_at")
     for name, at in moments.items():
-        if before is not None:  # of a picture that no camera has asked for, all but the first
+        if before is not None and at is not None:
             parts[name] = round(1e3 * max(at - before, 0.0), 2)
         before = at
     return parts

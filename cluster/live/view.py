@@ -112,8 +112,10 @@ def _hub(config: RunConfig, listening: Listening) -> Iterator[Hub]:
     from .hub import Hub
     from .services import RunServices
 
+    services = RunServices(config)
+    services.measure()
     with Hub(
-        RunServices(config),
+        services,
         bind=listening.bind,
         port=listening.port,
         zmq_port=listening.zmq_port,

@@ -21,8 +21,10 @@ PATIENCE_S = 10.0
 """A viewer that takes nothing for this long while something waits for it is dropped."""
 HELLO_S = 5.0
 MESSAGES_PER_S = 200.0
-"""What a viewer may say; of cameras above it the latest counts, anything else above it ends the viewer."""
-CAMERAS_PER_S = 2000.0
+"""What a viewer may say beside cameras; more ends it. Twice as many may come at once."""
+CAMERAS_PER_S = 200.0
+"""Cameras that are passed on; of more the latest counts. ``FLOOD_PER_S`` end the viewer."""
+FLOOD_PER_S = 2000.0
 _BURST_S = 2.0
 _ANSWERS = 32
 
@@ -105,6 +107,7 @@ class Viewer:
         self.screenshots: dict[int, float] = {}
         """Request → when it was made."""
         self.messages, self.cameras = Allowance(MESSAGES_PER_S), Allowance(CAMERAS_PER_S)
+        self.flood = Allowance(FLOOD_PER_S)
         self.late_camera: dict[str, Any] | None = None
         """The latest camera of those above the allowance."""
         self.sent_at = self.since = time.monotonic()

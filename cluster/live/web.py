@@ -8,10 +8,13 @@ starts: no request names a path.
 from __future__ import annotations
 
 import asyncio
+import fcntl
 import hmac
 import ipaddress
 import logging
 import socket
+import sys
+import termios
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -71,7 +74,7 @@ class _File(NamedTuple):
 def page_files() -> dict[str, _File]:
     """Address → file, of the files with known suffixes in the package's own directory ``page``."""
     files: dict[str, _File] = {}
-    directory = resources.files(__package__).joinpath("page")
+    directory = resources.files("splatpipe.cluster.live").joinpath("page")
     for file in directory.iterdir() if directory.is_dir() else ():
         kind = TYPES.get(PurePath(file.name).suffix)
         if kind is not None and file.is_file():
@@ -97,7 +100,12 @@ class _PageOutlet:
             await self._link.send_frame(parcel.text, WSMsgType.TEXT)
 
     def waiting_bytes(self) -> int:
-        return self._transport.get_write_buffer_size()
+        """Also what the kernel has, since that takes more only when a good part of it has gone."""
+        waiting = self._transport.get_write_buffer_size()
+        with suppress(OSError, ValueError):  # closed meanwhile
+            unsent = fcntl.ioctl(self._transport.get_extra_info("socket").fileno(), termios.TIOCOUTQ, bytes(4))
+            waiting += int.from_bytes(unsent, sys.byteorder)
+        return waiting
 
     def end(self, last: Parcel | None) -> None:
         if self.closing is None:
@@ -119,7 +127,8 @@ class _PageOutlet:
 class Site:
     """Serves the page and takes its WebSockets.
 
-    bind, port : where; port 0: any.  token : what a WebSocket must have in its address.
+    bind : as it was asked for, a name by which requests may call this host.  address : what that is in numbers.
+    token : what a WebSocket must have in its address.
     connect : a new viewer, or None where there are too many.  said : what one says; raises MessageError for what nobody
     may say.  left : it has gone, or is to go for a reason.
     Raises InputError where the address cannot be had.
@@ -128,21 +137,22 @@ class Site:
     def __init__(
         self,
         bind: str,
+        address: str,
         token: str,
         connect: Callable[[_PageOutlet], Viewer | None],
         said: Callable[[Viewer, dict[str, Any]], None],
         left: Callable[[Viewer, str], None],
     ) -> None:
-        self._bind, self._token = bind, token
+        self._address, self._token = address, token
         self._connect, self._said, self._left = connect, said, left
         self._files = page_files()
         self._names = _names_of(bind)
-        self._since: dict[Any, float] = {}  # connection → when it was accepted
+        self._since: dict[Any, float] = {}  # connection → when it was accepted, the oldest first
         self._pages: set[Any] = set()  # connections that are WebSockets
         self.port = 0
 
     async def start(self, port: int) -> None:
-        """Listen."""
+        """Listen; port 0: any."""
         app = web.Application(middlewares=[self._guard], client_max_size=1024, logger=_silent)
         app.router.add_get("/live", self._live)
         app.router.add_get("/{name:[^/]*}", self._file)
@@ -157,34 +167,46 @@ class Site:
         await self._runner.setup()
         try:
             loop = asyncio.get_running_loop()
-            self._listener = await loop.create_server(self._accept, self._bind, port, backlog=256, reuse_address=True)
+            self._listener = await loop.create_server(
+                self._accept, self._address, port, backlog=256, reuse_address=True
+            )
         except OSError as error:
             await self._runner.cleanup()
-            raise InputError(f"{self._bind}:{port}: cannot listen there: {error.strerror or error}") from None
+            raise InputError(f"{self._address}:{port}: cannot listen there: {error.strerror or error}") from None
         self.port = self._listener.sockets[0].getsockname()[1]
 
     def _accept(self) -> asyncio.BaseProtocol:
-        server: Any = self._runner.server
-        if len(server.connections) >= MAX_CONNECTIONS:
-            waiting = [protocol for protocol in server.connections if protocol not in self._pages]
-            if not waiting:
+        if len(self._since) >= MAX_CONNECTIONS:
+            self._forget()
+            others = [protocol for protocol in self._since if protocol not in self._pages]  # the oldest first
+            if len(self._since) >= MAX_CONNECTIONS and not (others and self._abort(others[0])):
                 return _Refused()
-            _abort(min(waiting, key=lambda protocol: self._since.get(protocol, 0.0)))
+        server: Any = self._runner.server
         protocol = server()
         self._since[protocol] = time.monotonic()
         return protocol
 
     def tick(self) -> None:
         """To be called now and then: ends connections that ask for nothing or take nothing."""
-        server: Any = self._runner.server
-        there = set(server.connections)
+        self._forget()
         now = time.monotonic()
-        self._since = {
-            protocol: since for protocol, since in self._since.items() if protocol in there or now - since < 1
-        }
-        for protocol, since in self._since.items():
+        for protocol, since in list(self._since.items()):
             if protocol not in self._pages and now - since > REQUEST_S:
-                _abort(protocol)
+                self._abort(protocol)
+
+    def _forget(self) -> None:
+        """Forget connections that have ended. One that has just been accepted has no transport either."""
+        now = time.monotonic()
+        for protocol, since in list(self._since.items()):
+            if protocol.transport is None and now - since > 1:
+                del self._since[protocol]
+
+    def _abort(self, protocol: Any) -> bool:
+        if protocol.transport is None:
+            return False
+        protocol.transport.abort()
+        del self._since[protocol]
+        return True
 
     async def close(self) -> None:
         """Stop listening, and end what is left."""
@@ -267,11 +289,6 @@ class _Refused(asyncio.Protocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         assert isinstance(transport, asyncio.Transport)
         transport.abort()
-
-
-def _abort(protocol: Any) -> None:
-    if protocol.transport is not None:
-        protocol.transport.abort()
 
 
 def _names_of(bind: str) -> set[str]:
