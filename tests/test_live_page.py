@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import base64
 import io
+import os
 import re
 import shutil
+import signal
+import subprocess
+import sys
 import time
 import tomllib
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +31,8 @@ if CHROMIUM is None:
 
 from splatpipe.cluster.live.hub import Hub  # noqa: E402
 from splatpipe.cluster.live.sockets import RunLink  # noqa: E402
+from splatpipe.shared.build import BuildSettings, build_scene  # noqa: E402
+from splatpipe.shared.synth import CityScan  # noqa: E402
 
 OPTIONS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
            "--disable-component-update", "--disable-sync"]  # fmt: skip
@@ -73,7 +80,7 @@ def visit(browser: Any) -> Iterator[Callable[..., Any]]:
     errors: list[str] = []
     with ExitStack() as open_pages:
 
-        def visit(url: str, width: int = WIDTH, height: int = HEIGHT, **context: Any) -> Any:
+        def visit(url: str, width: int = WIDTH, height: int = HEIGHT, start_s: float = 15, **context: Any) -> Any:
             made = browser.new_context(
                 viewport={"width": width, "height": height}, reduced_motion="reduce", accept_downloads=True, **context
             )
@@ -88,6 +95,7 @@ def visit(browser: Any) -> Iterator[Callable[..., Any]]:
             until(
                 page,
                 "window.splatpipe?.picture.shown?.still && splatpipe.picture.wanted(1920)[0] == splatpipe.picture.shown.width",
+                start_s,
             )
             return page
 
@@ -134,9 +142,8 @@ def at_rest(page: Any) -> int:
 
 
 def pixels(page: Any) -> np.ndarray:
-    data = page.evaluate("(async () => { const b = await new Promise(r => splatpipe.picture.canvas.toBlob(r));"
-                         " return [...new Uint8Array(await b.arrayBuffer())]; })()")  # fmt: skip
-    return np.asarray(Image.open(io.BytesIO(bytes(data))).convert("RGB"))
+    data = page.evaluate("splatpipe.picture.canvas.toDataURL().split(',')[1]")
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"))
 
 
 def drag(page: Any, start: tuple[float, float], end: tuple[float, float], button: str = "left") -> None:
@@ -413,23 +420,24 @@ def test_phones_get_sheets_and_fingers(visit, hub, run, width):
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_text_has_contrast(visit, hub, run, scheme):
-    page = visit(hub.url, color_scheme=scheme)
-    colours = page.evaluate("""() => ['--text', '--muted', '--accent', '--surface', '--raised', '--on-accent', '--tint'].map(name => {
-        const probe = document.createElement('i'); probe.style.color = `var(${name})`; document.body.append(probe);
-        const found = getComputedStyle(probe).color.match(/[0-9.]+/g).slice(0, 3).map(Number); probe.remove(); return found; })""")
+def test_text_has_contrast(modules, scheme):
+    modules.emulate_media(color_scheme=scheme)
+    colours = modules.evaluate(COLOURS)
     text, muted, accent, surface, raised, on_accent, tint = (_luminance(colour) for colour in colours)
-    pairs = [
-        (text, surface),
-        (muted, surface),
-        (accent, surface),
-        (text, raised),
-        (muted, raised),
-        (on_accent, accent),
-        (accent, tint),
-    ]
-    for one, two in pairs:
+    pairs = [(text, surface), (muted, surface), (accent, surface), (text, raised), (muted, raised)]
+    for one, two in [*pairs, (on_accent, accent), (accent, tint)]:
         assert (max(one, two) + 0.05) / (min(one, two) + 0.05) >= 4.5
+    assert (surface > text) == (scheme == "light")
+
+
+COLOURS = """['--text', '--muted', '--accent', '--surface', '--raised', '--on-accent', '--tint'].map(name => {
+    const probe = document.createElement('i');
+    probe.style.color = `var(${name})`;
+    document.body.append(probe);
+    const found = getComputedStyle(probe).color.match(/[0-9.]+/g).slice(0, 3).map(Number);
+    probe.remove();
+    return found;
+})"""
 
 
 def _luminance(rgb: list[float]) -> float:
@@ -443,6 +451,63 @@ def test_it_says_so_when_the_run_has_ended(visit, tmp_path):
         hub.close()
         page.get_by_text("The run has ended").wait_for()
     assert page.locator("#state").inner_text() == "ended"
+
+
+@pytest.mark.mpi
+def test_the_page_before_three_ranks(visit, tmp_path):
+    scene = tmp_path / "town.scene"
+    build_scene([CityScan(n_points=50_000)], scene, settings=BuildSettings(points_per_cell=1000))
+    config = tmp_path / "view.toml"
+    config.write_text(
+        f'[scene]\npath = "{scene}"\n[camera]\nwidth = 320\nheight = 200\n'
+        '[render]\nrasterizer = "cpu"\npoint_size_px = 2\nthreads = 1\n[pipeline]\ntopology = "pipelined"\n'
+    )
+    command = [
+        sys.executable,
+        "-m",
+        "splatpipe.cluster",
+        "view",
+        str(config),
+        "--connection",
+        str(tmp_path / "live.json"),
+    ]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+    ) as process:
+        try:
+            assert process.stdout
+            said: list[str] = []
+            while not (url := re.search(r"http://\S+", said[-1] if said else "")):
+                said.append(process.stdout.readline())
+                assert said[-1], "".join(said)
+            page = visit(url[0], start_s=90)
+            before = pixels(page)
+            assert before.shape == (HEIGHT, WIDTH, 3)
+            drag(page, (350, 240), (450, 260))
+            at_rest(page)
+            turned = pixels(page)
+            assert np.mean(np.any(turned != before, axis=2)) > 0.05
+            page.get_by_label("Colour", exact=True).select_option("elevation")
+            until(page, "splatpipe.settings['render.colour'] == 'elevation'")
+            at_rest(page)
+            holds(page, lambda: np.mean(np.any(pixels(page) != turned, axis=2)) > 0.05)
+            page.locator("#set-render-point_size_px").fill("99")
+            page.locator("#set-render-point_size_px").press("Enter")
+            page.get_by_text("render.point_size_px: found 99").wait_for()
+            page.keyboard.press("Tab")
+            page.keyboard.press("x")
+            page.get_by_label("Width in pixels").fill("640")
+            page.get_by_label("Height in pixels").fill("480")
+            with page.expect_download() as waiting:
+                page.get_by_role("button", name="Save picture").click()
+            with Image.open(waiting.value.path()) as image:
+                assert image.size == (640, 480)
+            process.send_signal(signal.SIGINT)
+            page.get_by_text("The run has ended").wait_for()
+            assert process.wait(30) == 0
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)  # with the ranks, where the test has failed
 
 
 def test_nothing_in_the_page_is_inline_or_from_elsewhere():
