@@ -32,6 +32,7 @@ if CHROMIUM is None:
 from splatpipe.cluster.live.hub import Hub  # noqa: E402
 from splatpipe.cluster.live.sockets import RunLink  # noqa: E402
 from splatpipe.shared.build import BuildSettings, build_scene  # noqa: E402
+from splatpipe.shared.keyframes import Key, KeyframePath  # noqa: E402
 from splatpipe.shared.synth import CityScan  # noqa: E402
 
 OPTIONS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
@@ -567,6 +568,40 @@ MATH = """async ([up, lower, upper]) => {
   found.top = c.dot(Object.fromEntries(tops).top, basis.u);
   return found;
 }"""
+
+
+def test_a_path_is_played_as_run_draws_it(modules):
+    rng = np.random.default_rng(3)
+    base = np.array([6.4e6, 1e5, 0.0])
+    times = [0.0, 0.7, 1.0, 2.5, 2.6, 4.0]
+    eyes, targets = base + rng.normal(0, 50, (6, 3)) + [0, -200, 80], base + rng.normal(0, 10, (6, 3))
+    eyes[3], targets[3] = eyes[2], targets[2]  # where it rests
+    degrees = [40, 50, 60, 60, 45, 30]
+    keys = [
+        {"time": t, "view": {"eye": eye.tolist(), "target": target.tolist(), "up": [0, 0, 1], "fov_deg": fov}}
+        for t, eye, target, fov in zip(times, eyes, targets, degrees, strict=True)
+    ]
+    asked = np.linspace(-0.5, 4.5, 41)
+    views = modules.evaluate(
+        """async ([keys, times]) => {
+            const c = await import('/camera.js');
+            const basis = c.basisOf('z');
+            const path = c.pathThrough(keys.map(({ time, view }) => ({ time, camera: c.cameraOf(view, basis, 300) })));
+            return times.map(time => c.viewOf(path(time)));
+        }""",
+        [keys, asked.tolist()],
+    )
+    path = KeyframePath(
+        tuple(Key(t, e, g, np.radians(f)) for t, e, g, f in zip(times, eyes, targets, degrees, strict=True)),
+        np.array([0.0, 0.0, 1.0]),
+    )
+    for at, view in zip(asked, views, strict=True):
+        pose = path.pose(at)
+        axis = np.subtract(view["target"], view["eye"])
+        assert view["eye"] == pytest.approx(pose[:3, 3], rel=0, abs=1e-6)
+        assert axis / np.linalg.norm(axis) == pytest.approx(-pose[:3, 2], abs=1e-8)
+        assert view["up"] == pytest.approx(pose[:3, 1], abs=1e-8)
+        assert view["fov_deg"] == pytest.approx(np.degrees(path.fov_y_rad(at)))
 
 
 @pytest.mark.parametrize(
