@@ -18,9 +18,10 @@ aiohttp = pytest.importorskip("aiohttp", reason="aiohttp is missing: splatpipe[l
 
 import live_example as example
 from live_example import JPEG, VIEW, Answers, FakeRun, Page, next_of, until
-from splatpipe.cluster.live import gathered, switchboard, web
+from splatpipe.cluster.live import gathered, screenshots, switchboard, web
 from splatpipe.cluster.live.connection import Connection, RunAddress, find_connection, new_connection_file
 from splatpipe.cluster.live.hub import Hub
+from splatpipe.cluster.live.protocol import ScreenshotWanted
 from splatpipe.cluster.live.sockets import Client, RunLink
 from splatpipe.shared.errors import InputError, SplatpipeError
 
@@ -184,9 +185,10 @@ def test_a_screenshot_goes_to_who_asked_for_it(hub, run, viewer):
         for request in (1, 2, 3):
             viewer.send({"kind": "screenshot", "request": request, "width": 640, "height": 480})
         assert next_of(viewer, "refused").header["request"] == 3
-        asked = run.told("screenshot", 2)
-        assert [(one["request"], one["width"], one["height"]) for one in asked] == [(1, 640, 480), (2, 640, 480)]
-        for frame, one in zip((7, 8), asked, strict=True):  # of one the picture comes first
+        for frame, request in ((7, 1), (8, 2)):  # of the second the picture comes before its "started"
+            one = run.told("screenshot", request)[-1]
+            assert (one["request"], one["width"], one["height"]) == (request, 640, 480)
+            assert len(run.all("screenshot")) == request  # one after the other
             started = {"kind": "started", "frame": frame, "screenshot": {k: one[k] for k in ("viewer", "request")}}
             taken = {"kind": "screenshot", "frame": frame, "width": 640, "height": 480}
             first, second = [lambda m=started: run.coordinator.send(m), lambda m=taken: run.display.send(m, b"PNG")][
@@ -198,6 +200,38 @@ def test_a_screenshot_goes_to_who_asked_for_it(hub, run, viewer):
             got = next_of(viewer, "screenshot")
             assert got == ({"kind": "screenshot", "request": one["request"], "width": 640, "height": 480}, b"PNG")
         assert other.receive(0.1) is None
+
+
+def test_screenshots_leave_the_run_time_for_pictures(monkeypatch):
+    clock, told, refused = [100.0], [], []
+    monkeypatch.setattr(screenshots.time, "monotonic", lambda: clock[0])
+    shots = screenshots.Screenshots(lambda header: told.append(header) or True, lambda *why: refused.append(why))
+
+    def ask(viewer: int, request: int) -> None:
+        shots.ask(viewer, ScreenshotWanted(kind="screenshot", request=request, width=10, height=20))
+
+    for viewer in range(1, 5):
+        for request in range(2):
+            ask(viewer, request)
+    with pytest.raises(InputError, match="under way"):
+        ask(1, 7)
+    with pytest.raises(InputError, match="too many"):
+        ask(5, 0)
+    assert told == [{"kind": "screenshot", "viewer": 1, "request": 0, "width": 10, "height": 20}]
+    clock[0] += 2
+    assert not shots.done(1, 1)
+    assert shots.done(1, 0)
+    shots.forget(2)
+    for second in range(1, 11):
+        shots.tick()
+        assert len(told) == 1, second
+        clock[0] += 1
+    shots.tick()
+    assert [(one["viewer"], one["request"]) for one in told] == [(1, 0), (1, 1)]
+    clock[0] += 121
+    shots.tick()  # the run has not answered: the next one
+    assert refused == [(1, 1, "no picture within 120 s")]
+    assert told[-1]["viewer"] == 3
 
 
 def test_services_answer_beside_the_run(run, answers, viewer):
@@ -597,6 +631,7 @@ def test_nothing_is_said_when_the_interpreter_ends(tmp_path):
 from pathlib import Path
 from live_example import *
 from splatpipe.cluster.live.hub import Hub
+from splatpipe.cluster.live.protocol import ScreenshotWanted
 from splatpipe.cluster.live.sockets import Client
 with Hub(Answers(), connection=Path({str(tmp_path / "live.json")!r})) as hub, FakeRun(hub.run_address) as run:
     run.ready()
