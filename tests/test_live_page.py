@@ -32,6 +32,7 @@ if CHROMIUM is None:
 from splatpipe.cluster.live.hub import Hub  # noqa: E402
 from splatpipe.cluster.live.sockets import RunLink  # noqa: E402
 from splatpipe.shared.build import BuildSettings, build_scene  # noqa: E402
+from splatpipe.shared.keyframes import Key, KeyframePath  # noqa: E402
 from splatpipe.shared.synth import CityScan  # noqa: E402
 
 OPTIONS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
@@ -150,7 +151,7 @@ def drag(page: Any, start: tuple[float, float], end: tuple[float, float], button
     page.mouse.move(*start)
     page.mouse.down(button=button)
     page.mouse.move(*end, steps=6)
-    page.wait_for_timeout(60)
+    until(page, "!splatpipe.unsent")
     page.mouse.up(button=button)
 
 
@@ -221,7 +222,7 @@ def test_the_wheel_keeps_the_point_under_the_cursor_and_ends_still(page, run):
     holds(page, lambda: not run.cameras[-1]["moving"])
     at_rest(page)
     assert page.evaluate("splatpipe.camera.distance") < 0.8 * distance
-    assert places(page, [point])[0] == pytest.approx(here, abs=12)
+    assert places(page, [point])[0] == pytest.approx(here, abs=40)  # exact once the hub has said what lies there
 
 
 def test_keys_steer_and_open(page, run):
@@ -236,7 +237,7 @@ def test_keys_steer_and_open(page, run):
     page.keyboard.press("g")
     eye = np.array(page.evaluate("splatpipe.picture.shown.view.eye"))
     page.keyboard.down("w")
-    page.wait_for_timeout(150)
+    until(page, f"splatpipe.cameras.viewOf(splatpipe.camera).eye[1] > {eye[1]}")
     page.keyboard.up("w")
     at_rest(page)
     assert page.evaluate("splatpipe.picture.shown.view.eye[1]") > eye[1]
@@ -364,10 +365,16 @@ def test_the_monitor_shows_ranks_against_the_model_and_what_is_left_out(page, ru
 
 
 def test_it_comes_back_by_itself_after_a_loss(page, run, hub):
+    page.evaluate("""{
+        window.seen = [];
+        const text = id => document.getElementById(id).textContent;
+        splatpipe.connection.addEventListener('state', () =>
+            seen.push([splatpipe.connection.state.name, text('notice-title'), text('state-text')]));
+    }""")
     for viewer in list(hub._board._viewers.values()):
         hub._loop.call_soon_threadsafe(hub._board.leave, viewer, "takes nothing")
-    page.get_by_text("Connection lost").wait_for()
-    assert page.locator("#state").inner_text().startswith("reconnecting")
+    until(page, "seen.length > 0")
+    assert page.evaluate("seen[0]") == ["waiting", "Connection lost", "reconnecting in 1 s"]
     run.link.send({"kind": "settings", "settings": {**run.settings, "camera.width": 640}})
     run.settings["camera.width"] = 640
     until(page, "splatpipe.connection.state.name == 'open'")
@@ -561,6 +568,40 @@ MATH = """async ([up, lower, upper]) => {
   found.top = c.dot(Object.fromEntries(tops).top, basis.u);
   return found;
 }"""
+
+
+def test_a_path_is_played_as_run_draws_it(modules):
+    rng = np.random.default_rng(3)
+    base = np.array([6.4e6, 1e5, 0.0])
+    times = [0.0, 0.7, 1.0, 2.5, 2.6, 4.0]
+    eyes, targets = base + rng.normal(0, 50, (6, 3)) + [0, -200, 80], base + rng.normal(0, 10, (6, 3))
+    eyes[3], targets[3] = eyes[2], targets[2]  # where it rests
+    degrees = [40, 50, 60, 60, 45, 30]
+    keys = [
+        {"time": t, "view": {"eye": eye.tolist(), "target": target.tolist(), "up": [0, 0, 1], "fov_deg": fov}}
+        for t, eye, target, fov in zip(times, eyes, targets, degrees, strict=True)
+    ]
+    asked = np.linspace(-0.5, 4.5, 41)
+    views = modules.evaluate(
+        """async ([keys, times]) => {
+            const c = await import('/camera.js');
+            const basis = c.basisOf('z');
+            const path = c.pathThrough(keys.map(({ time, view }) => ({ time, camera: c.cameraOf(view, basis, 300) })));
+            return times.map(time => c.viewOf(path(time)));
+        }""",
+        [keys, asked.tolist()],
+    )
+    path = KeyframePath(
+        tuple(Key(t, e, g, np.radians(f)) for t, e, g, f in zip(times, eyes, targets, degrees, strict=True)),
+        np.array([0.0, 0.0, 1.0]),
+    )
+    for at, view in zip(asked, views, strict=True):
+        pose = path.pose(at)
+        axis = np.subtract(view["target"], view["eye"])
+        assert view["eye"] == pytest.approx(pose[:3, 3], rel=0, abs=1e-6)
+        assert axis / np.linalg.norm(axis) == pytest.approx(-pose[:3, 2], abs=1e-8)
+        assert view["up"] == pytest.approx(pose[:3, 1], abs=1e-8)
+        assert view["fov_deg"] == pytest.approx(np.degrees(path.fov_y_rad(at)))
 
 
 @pytest.mark.parametrize(

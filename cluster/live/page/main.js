@@ -202,8 +202,10 @@ function welcomed(header) {
   app.run = run;
   app.unit = run.units === undefined ? "m" : run.units || "units";
   settings = header.settings ?? {};
-  camera = cameras.cameraOf(header.view, cameras.basisOf(run.up), size);
-  if (homeOf !== run.scene) [home, homeOf] = [camera, run.scene];
+  if (homeOf !== run.scene) { // after a loss the camera stays, or follows the picture
+    camera = home = cameras.cameraOf(header.view, cameras.basisOf(run.up), size);
+    homeOf = run.scene;
+  }
   picture.restart();
   monitor.restart();
   sent.clear();
@@ -421,6 +423,7 @@ window.splatpipe = {
   connection, picture, controls, panel, cameras, latencies,
   get camera() { return camera; },
   set camera(next) { steer(next, true); },
+  get unsent() { return unsent !== null; },
   get run() { return run; },
   get settings() { return settings; },
 };
