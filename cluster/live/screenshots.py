@@ -15,7 +15,7 @@ from .protocol import ScreenshotWanted
 
 MAX_WAITING = 8
 MAX_WAITING_EACH = 2
-REST = 5.0
+REST = 8.0
 MAX_REST_S = 30.0
 PATIENCE_S = 120.0
 """With the run, for one; then it is given up."""
