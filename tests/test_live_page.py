@@ -208,6 +208,23 @@ def test_a_drag_turns_the_camera_and_changes_the_picture(page, run):
     assert page.evaluate("splatpipe.latencies.length") > 0
 
 
+def test_pictures_out_of_order_and_broken_ones_are_acknowledged_and_not_shown(page, run):
+    frame, acknowledged = page.evaluate("""async () => {
+        const { picture } = splatpipe, acknowledge = picture.acknowledge, acknowledged = [];
+        picture.acknowledge = frame => acknowledged.push(frame);
+        const small = Object.assign(document.createElement('canvas'), { width: 8, height: 8 });
+        small.getContext('2d').fillRect(0, 0, 1, 1);
+        const png = new Uint8Array(await (await new Promise(done => small.toBlob(done))).arrayBuffer());
+        const header = { encoding: 'png', view: picture.shown.view, still: true, scale: 1 };
+        await picture.accept({ ...header, frame: picture.shown.frame - 1 }, png);
+        await picture.accept({ ...header, frame: picture.shown.frame + 1 }, png.slice(0, 40));
+        picture.acknowledge = acknowledge;
+        return [picture.shown.frame, acknowledged];
+    }""")
+    assert acknowledged == [frame - 1, frame + 1]
+    assert pixels(page).shape == (HEIGHT, WIDTH, 3)
+
+
 def test_the_wheel_keeps_the_point_under_the_cursor_and_ends_still(page, run):
     point = visible_points(page, run, 1)[0].tolist()
     start = places(page, [point])[0]
