@@ -8,9 +8,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from ...shared.config import LiveSection
 from ...shared.errors import SplatpipeError
 from ...shared.messages import FrameStart, Kind, Use
+from ...shared.store import Scene
 from ...shared.windows import tiles
 from ..layout import Layout, Plan
 from .protocol import LiveMessage, View
@@ -32,6 +35,7 @@ _POLL_S = 0.001
 """How long a coordinator that waits for ranks as well listens to the hub at a time."""
 _IDLE_S = 0.25
 _LATENCIES = 256
+_MAX_LOOKED_AT = 1 << 26
 
 
 class LiveCoordinator:
@@ -65,6 +69,7 @@ class LiveCoordinator:
             "upper": list(info.upper),
             "up": job.views.path.up.tolist(),
             "attributes": sorted(info.attributes),
+            "classes": _classes(job.scene),
             "topology": job.config.pipeline.topology,
             "rasterizer": job.rasterizer,
             "ranks": ranks,
@@ -225,6 +230,16 @@ class LiveCoordinator:
 
     def _quit(self) -> None:
         self._over = True
+
+
+def _classes(scene: Scene) -> list[int]:
+    """Codes of classes that points of a scene have; none where there are too many points to look at.
+
+    Cost: one read of a byte a point.
+    """
+    if "classification" not in scene.info.attributes or scene.info.n_stored > _MAX_LOOKED_AT:
+        return []
+    return np.flatnonzero(np.bincount(scene.attribute("classification"), minlength=1)).tolist()
 
 
 def _usable(view: View) -> View:

@@ -17,7 +17,7 @@ from .protocol import View
 SCALES = (1.0, 0.84, 0.71, 0.59, 0.5, 0.42, 0.35, 0.3, 0.25, 0.21, 0.18, 0.15, 0.125, 0.1)
 """Of the sides of a picture while the camera moves: some 1.4 in pixels from one to the next."""
 MULTIPLE_PX = 8
-"""Sides of smaller pictures are multiples of this."""
+"""Widths of smaller pictures are multiples of this."""
 MAX_SCREENSHOTS = 4
 _BUSY = 0.9
 """Share of the time between two pictures that drawing one may take."""
@@ -176,5 +176,5 @@ class Steering:
 def _sized(size: tuple[int, int], scale: float) -> tuple[int, int]:
     if scale == 1.0:
         return size
-    width, height = (max(MULTIPLE_PX, round(side * scale / MULTIPLE_PX) * MULTIPLE_PX) for side in size)
-    return min(width, size[0]), min(height, size[1])
+    width = min(max(MULTIPLE_PX, round(size[0] * scale / MULTIPLE_PX) * MULTIPLE_PX), size[0])
+    return width, max(1, round(size[1] * width / size[0]))  # the same shape: nothing jumps when the camera stands
