@@ -18,12 +18,18 @@ aiohttp = pytest.importorskip("aiohttp", reason="aiohttp is missing: splatpipe[l
 
 import live_example as example
 from live_example import JPEG, VIEW, Answers, FakeRun, Page, next_of, until
-from splatpipe.cluster.live import gathered, screenshots, switchboard, web
+from splatpipe.cluster.live import gathered, screenshots, switchboard, viewers, web
+from splatpipe.cluster.live import hub as hub_module
 from splatpipe.cluster.live.connection import Connection, RunAddress, find_connection, new_connection_file
 from splatpipe.cluster.live.hub import Hub
 from splatpipe.cluster.live.protocol import ScreenshotWanted
 from splatpipe.cluster.live.sockets import Client, RunLink
 from splatpipe.shared.errors import InputError, SplatpipeError
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch):
+    monkeypatch.setattr(hub_module, "TICK_S", 0.05)
 
 
 @pytest.fixture
@@ -114,16 +120,14 @@ def test_of_more_cameras_than_are_allowed_the_last_still_counts_and_of_others_no
     assert "messages a second" in next_of(viewer, "bye").header["why"]
 
 
-def test_who_floods_it_with_cameras_is_dropped(run, viewer, monkeypatch):
-    next_of(viewer, "welcome")
-    bye = None
-    for x in range(20_000):
-        viewer.send(camera(float(x)))
-        if x % 500 == 0 and (bye := viewer.receive(0.05)) is not None:
-            break
-    assert bye is not None
-    assert bye.kind == "bye"
-    assert "cameras a second" in bye.header["why"]
+def test_who_floods_it_with_cameras_is_dropped(hub, run, monkeypatch):
+    monkeypatch.setattr(switchboard, "FLOOD_PER_S", 300.0)
+    monkeypatch.setattr(viewers, "FLOOD_PER_S", 300.0)
+    with Page(hub.url) as viewer:
+        next_of(viewer, "welcome")
+        for x in range(1200):
+            viewer.send(camera(float(x)))
+        assert "300 cameras a second" in next_of(viewer, "bye").header["why"]
 
 
 def test_three_pictures_are_under_way_at_most_and_then_the_latest(run, viewer):
@@ -132,9 +136,8 @@ def test_three_pictures_are_under_way_at_most_and_then_the_latest(run, viewer):
         run.show()
         time.sleep(0.02)
     assert [next_of(viewer, "picture").header["frame"] for _ in range(3)] == [1, 2, 3]
-    assert viewer.receive(0.2) is None
     viewer.send({"kind": "ack", "frame": 99})  # never sent
-    assert viewer.receive(0.2) is None
+    assert viewer.receive(0.1) is None
     viewer.send({"kind": "ack", "frame": 2})  # with those before
     assert next_of(viewer, "picture").header["frame"] == 10
 
