@@ -147,6 +147,12 @@ def pixels(page: Any) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"))
 
 
+def changed_share(page: Any, before: np.ndarray) -> float:
+    """Of the pixels that differ; 0 while the picture has another size, as while something moves."""
+    now = pixels(page)
+    return float(np.mean(np.any(now != before, axis=2))) if now.shape == before.shape else 0.0
+
+
 def drag(page: Any, start: tuple[float, float], end: tuple[float, float], button: str = "left") -> None:
     page.mouse.move(*start)
     page.mouse.down(button=button)
@@ -204,8 +210,25 @@ def test_a_drag_turns_the_camera_and_changes_the_picture(page, run):
     assert np.linalg.norm(np.subtract(after["eye"], after["target"])) == pytest.approx(
         np.linalg.norm(np.subtract(view["eye"], view["target"])), rel=1e-10
     )
-    assert np.mean(np.any(pixels(page) != before, axis=2)) > 0.1
+    assert changed_share(page, before) > 0.1
     assert page.evaluate("splatpipe.latencies.length") > 0
+
+
+def test_pictures_out_of_order_and_broken_ones_are_acknowledged_and_not_shown(page, run):
+    frame, acknowledged = page.evaluate("""async () => {
+        const { picture } = splatpipe, acknowledge = picture.acknowledge, acknowledged = [];
+        picture.acknowledge = frame => acknowledged.push(frame);
+        const small = Object.assign(document.createElement('canvas'), { width: 8, height: 8 });
+        small.getContext('2d').fillRect(0, 0, 1, 1);
+        const png = new Uint8Array(await (await new Promise(done => small.toBlob(done))).arrayBuffer());
+        const header = { encoding: 'png', view: picture.shown.view, still: true, scale: 1 };
+        await picture.accept({ ...header, frame: picture.shown.frame - 1 }, png);
+        await picture.accept({ ...header, frame: picture.shown.frame + 1 }, png.slice(0, 40));
+        picture.acknowledge = acknowledge;
+        return [picture.shown.frame, acknowledged];
+    }""")
+    assert acknowledged == [frame - 1, frame + 1]
+    assert pixels(page).shape == (HEIGHT, WIDTH, 3)
 
 
 def test_the_wheel_keeps_the_point_under_the_cursor_and_ends_still(page, run):
@@ -264,7 +287,7 @@ def test_a_setting_changes_the_run_and_the_picture_and_a_group_is_reset(page, ru
     page.get_by_label("Colour", exact=True).select_option("classification")
     holds(page, lambda: run.settings["render.colour"] == "classification")
     until(page, "splatpipe.settings['render.colour'] == 'classification'")
-    holds(page, lambda: np.mean(np.any(pixels(page) != before, axis=2)) > 0.1)
+    holds(page, lambda: changed_share(page, before) > 0.1)
     page.locator("summary", has_text="Filter").click()
     page.get_by_role("checkbox", name="water").uncheck()
     holds(page, lambda: run.settings["filter.classes"] == [2, 5, 6])
@@ -493,11 +516,11 @@ def test_the_page_before_three_ranks(visit, tmp_path):
             drag(page, (350, 240), (450, 260))
             at_rest(page)
             turned = pixels(page)
-            assert np.mean(np.any(turned != before, axis=2)) > 0.05
+            assert changed_share(page, before) > 0.05
             page.get_by_label("Colour", exact=True).select_option("elevation")
             until(page, "splatpipe.settings['render.colour'] == 'elevation'")
             at_rest(page)
-            holds(page, lambda: np.mean(np.any(pixels(page) != turned, axis=2)) > 0.05)
+            holds(page, lambda: changed_share(page, turned) > 0.05)
             page.locator("#set-render-point_size_px").fill("99")
             page.locator("#set-render-point_size_px").press("Enter")
             page.get_by_text("render.point_size_px: found 99").wait_for()
