@@ -69,7 +69,7 @@ def test_a_viewer_is_welcomed_when_the_run_is_ready_and_shown_its_last_picture(h
         assert welcome["run"] == example.RUN
         assert (welcome["view"], welcome["settings"], welcome["choices"]) == (VIEW, example.SETTINGS, example.CHOICES)
         assert welcome["protocol"] == 1
-        assert run.told("viewers")[-1]["pictures"] == 1
+        until(lambda: run.last("viewers", "pictures") == 1, "the count")
         run.show(JPEG, t=4.5)
         shown = next_of(viewer, "picture")
         with Client(hub.connection, pictures=True) as late:
@@ -154,7 +154,7 @@ def test_the_first_to_acknowledge_a_picture_tells_the_run(hub, run):
             run.told("shown", frame)
         time.sleep(0.1)
         assert [told["frame"] for told in run.all("shown")] == [1, 2]
-        assert run.told("viewers")[-1]["pictures"] == 2
+        until(lambda: run.last("viewers", "pictures") == 2, "the count")
         program.send({"kind": "subscribe", "pictures": False, "metrics": False})
         until(lambda: run.last("viewers", "pictures") == 1, "one less")
     until(lambda: run.last("viewers", "pictures") == 0, "none")

@@ -139,7 +139,7 @@ def test_without_the_right_keys_nobody_gets_in(hub, run, good, door, who):
         assert see(good) == JPEG
         assert not stranger.hears(0.2)
     assert {message.kind for message in run.heard[heard:]} <= {"shown", "viewers"}
-    assert run.last("viewers", "pictures") == 1
+    until(lambda: run.last("viewers", "pictures") == 1, "the run to know")
     good.send(camera(1.0))
     assert run.told("camera")[0]["t"] == 1.0  # and not to a rank 0 that is none
 
@@ -542,7 +542,7 @@ def test_fifty_viewers_come_and_go_and_memory_stays_flat(hub, run, monkeypatch):
         until(lambda: not hub._board._viewers, "all to have gone")
         resident.append(example.resident_bytes())
         left.append(example.left_behind())
-    assert run.last("viewers", "pictures") == 0
+    until(lambda: run.last("viewers", "pictures") == 0, "the run to know")
     assert max(resident[2:]) - resident[1] < 30 << 20
     assert left[-1][0] == left[0][0]
     assert abs(left[-1][1] - left[0][1]) <= 2
