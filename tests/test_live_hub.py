@@ -417,15 +417,12 @@ def test_a_rank_that_connects_again_is_the_same_rank(hub, run, viewer):
 def test_a_link_takes_messages_and_sends_from_several_threads(hub, run):
     with Client(hub.connection, metrics=True) as viewer:
         next_of(viewer, "welcome")
-        values = [
-            threading.Thread(
-                target=lambda rank=rank: [
-                    run.coordinator.send({"kind": "metrics", "rank": rank, "values": {"n": n}}) or time.sleep(0.001)
-                    for n in range(200)
-                ]
-            )
-            for rank in range(4)
-        ]
+
+        def measure(rank: int) -> None:
+            for n in range(200):
+                until(lambda n=n: run.coordinator.send({"kind": "metrics", "rank": rank, "values": {"n": n}}), "room")
+
+        values = [threading.Thread(target=measure, args=(rank,)) for rank in range(4)]
         for thread in values:
             thread.start()
         for x in range(100):
