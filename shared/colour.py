@@ -140,6 +140,8 @@ def colour_words(scene: Scene, colouring: Colouring) -> np.ndarray:
     colour, which is repeated with stride 0).
     """
     n = scene.info.n_stored
+    if not n:  # a scene without points has no columns either
+        return np.empty(0, "<u4")
     match colouring.mode:
         case "rgb":
             return scene.attribute("rgb")

@@ -1,4 +1,4 @@
-"""scripts/bench_live against a real run, with all of its load."""
+"""scripts/bench_live against a real run."""
 
 import json
 import subprocess
@@ -12,7 +12,7 @@ from splatpipe.shared.synth import CityScan
 SCRIPT = Path(__file__).resolve().parents[1] / "scripts" / "bench_live"
 
 
-def test_a_drag_is_timed_alone_and_beside_others(tmp_path):
+def test_a_drag_is_timed(tmp_path):
     pytest.importorskip("zmq", reason="pyzmq is missing: splatpipe[live]")
     pytest.importorskip("aiohttp", reason="aiohttp is missing: splatpipe[live]")
     build_scene([CityScan(n_points=20_000)], tmp_path / "city.scene", settings=BuildSettings())
@@ -29,17 +29,15 @@ def test_a_drag_is_timed_alone_and_beside_others(tmp_path):
         "--set",
         "pipeline.topology=single",
     ]
-    command += ["--set", "render.rasterizer=cpu", "--viewers", "4", "--slow", "1", "--vanish", "--fuzz"]
+    command += ["--set", "render.rasterizer=cpu"]
     done = subprocess.run([*command, "--json", tmp_path / "found.json"], capture_output=True, text=True, timeout=100)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "left behind: nothing" in done.stdout
     found = json.loads((tmp_path / "found.json").read_text())
-    assert list(found["phases"]) == ["alone", "with load", "after it"]
-    for phase in found["phases"].values():
-        assert phase["pictures"] > 0
-        assert 0 < phase["latency_ms"]["median"] <= phase["latency_ms"]["p95"]
-        assert {"drawing", "encoding", "decode"} <= set(phase["parts_ms"])
-        assert sum(of["median"] for of in phase["parts_ms"].values()) < 2 * phase["latency_ms"]["max"]
-        assert phase["still"]["encoding"] == "png"
-        assert phase["still"]["size"] == [160, 90]
-        assert phase["memory_bytes"]["hub"]["last"] > 1e6
+    assert found["pictures"] > 0
+    assert 0 < found["latency_ms"]["median"] <= found["latency_ms"]["p95"]
+    assert {"drawing", "encoding", "decode"} <= set(found["parts_ms"])
+    assert sum(of["median"] for of in found["parts_ms"].values()) < 2 * found["latency_ms"]["max"]
+    assert found["still"]["encoding"] == "png"
+    assert found["still"]["size"] == [160, 90]
+    assert found["memory_bytes"]["hub"]["last"] > 1e6

@@ -113,3 +113,12 @@ def test_a_layer_that_is_not_there_is_refused(folder):
     assert done.returncode == 2
     assert "nowhere.layer" in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
+
+
+@pytest.mark.gl
+@needs_gl
+def test_objects_alone_need_no_scene(folder):
+    done = run(folder, "alone", "scene.path=", "pipeline.topology=single", "output.frames=1")
+    assert done.returncode == 0, done.stderr
+    shown = picture(folder, "alone", 0)
+    assert 0.02 < (shown != shown[0, 0]).any(axis=2).mean() < 0.9

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import base64
 import io
+import os
 import re
 import shutil
+import signal
+import subprocess
+import sys
 import time
 import tomllib
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +31,9 @@ if CHROMIUM is None:
 
 from splatpipe.cluster.live.hub import Hub  # noqa: E402
 from splatpipe.cluster.live.sockets import RunLink  # noqa: E402
+from splatpipe.shared.build import BuildSettings, build_scene  # noqa: E402
+from splatpipe.shared.keyframes import Key, KeyframePath  # noqa: E402
+from splatpipe.shared.synth import CityScan  # noqa: E402
 
 OPTIONS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
            "--disable-component-update", "--disable-sync"]  # fmt: skip
@@ -73,7 +81,7 @@ def visit(browser: Any) -> Iterator[Callable[..., Any]]:
     errors: list[str] = []
     with ExitStack() as open_pages:
 
-        def visit(url: str, width: int = WIDTH, height: int = HEIGHT, **context: Any) -> Any:
+        def visit(url: str, width: int = WIDTH, height: int = HEIGHT, start_s: float = 15, **context: Any) -> Any:
             made = browser.new_context(
                 viewport={"width": width, "height": height}, reduced_motion="reduce", accept_downloads=True, **context
             )
@@ -88,6 +96,7 @@ def visit(browser: Any) -> Iterator[Callable[..., Any]]:
             until(
                 page,
                 "window.splatpipe?.picture.shown?.still && splatpipe.picture.wanted(1920)[0] == splatpipe.picture.shown.width",
+                start_s,
             )
             return page
 
@@ -134,16 +143,21 @@ def at_rest(page: Any) -> int:
 
 
 def pixels(page: Any) -> np.ndarray:
-    data = page.evaluate("(async () => { const b = await new Promise(r => splatpipe.picture.canvas.toBlob(r));"
-                         " return [...new Uint8Array(await b.arrayBuffer())]; })()")  # fmt: skip
-    return np.asarray(Image.open(io.BytesIO(bytes(data))).convert("RGB"))
+    data = page.evaluate("splatpipe.picture.canvas.toDataURL().split(',')[1]")
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"))
+
+
+def changed_share(page: Any, before: np.ndarray) -> float:
+    """Of the pixels that differ; 0 while the picture has another size, as while something moves."""
+    now = pixels(page)
+    return float(np.mean(np.any(now != before, axis=2))) if now.shape == before.shape else 0.0
 
 
 def drag(page: Any, start: tuple[float, float], end: tuple[float, float], button: str = "left") -> None:
     page.mouse.move(*start)
     page.mouse.down(button=button)
     page.mouse.move(*end, steps=6)
-    page.wait_for_timeout(60)
+    until(page, "!splatpipe.unsent")
     page.mouse.up(button=button)
 
 
@@ -196,8 +210,25 @@ def test_a_drag_turns_the_camera_and_changes_the_picture(page, run):
     assert np.linalg.norm(np.subtract(after["eye"], after["target"])) == pytest.approx(
         np.linalg.norm(np.subtract(view["eye"], view["target"])), rel=1e-10
     )
-    assert np.mean(np.any(pixels(page) != before, axis=2)) > 0.1
+    assert changed_share(page, before) > 0.1
     assert page.evaluate("splatpipe.latencies.length") > 0
+
+
+def test_pictures_out_of_order_and_broken_ones_are_acknowledged_and_not_shown(page, run):
+    frame, acknowledged = page.evaluate("""async () => {
+        const { picture } = splatpipe, acknowledge = picture.acknowledge, acknowledged = [];
+        picture.acknowledge = frame => acknowledged.push(frame);
+        const small = Object.assign(document.createElement('canvas'), { width: 8, height: 8 });
+        small.getContext('2d').fillRect(0, 0, 1, 1);
+        const png = new Uint8Array(await (await new Promise(done => small.toBlob(done))).arrayBuffer());
+        const header = { encoding: 'png', view: picture.shown.view, still: true, scale: 1 };
+        await picture.accept({ ...header, frame: picture.shown.frame - 1 }, png);
+        await picture.accept({ ...header, frame: picture.shown.frame + 1 }, png.slice(0, 40));
+        picture.acknowledge = acknowledge;
+        return [picture.shown.frame, acknowledged];
+    }""")
+    assert acknowledged == [frame - 1, frame + 1]
+    assert pixels(page).shape == (HEIGHT, WIDTH, 3)
 
 
 def test_the_wheel_keeps_the_point_under_the_cursor_and_ends_still(page, run):
@@ -214,7 +245,7 @@ def test_the_wheel_keeps_the_point_under_the_cursor_and_ends_still(page, run):
     holds(page, lambda: not run.cameras[-1]["moving"])
     at_rest(page)
     assert page.evaluate("splatpipe.camera.distance") < 0.8 * distance
-    assert places(page, [point])[0] == pytest.approx(here, abs=12)
+    assert places(page, [point])[0] == pytest.approx(here, abs=40)  # exact once the hub has said what lies there
 
 
 def test_keys_steer_and_open(page, run):
@@ -229,7 +260,7 @@ def test_keys_steer_and_open(page, run):
     page.keyboard.press("g")
     eye = np.array(page.evaluate("splatpipe.picture.shown.view.eye"))
     page.keyboard.down("w")
-    page.wait_for_timeout(150)
+    until(page, f"splatpipe.cameras.viewOf(splatpipe.camera).eye[1] > {eye[1]}")
     page.keyboard.up("w")
     at_rest(page)
     assert page.evaluate("splatpipe.picture.shown.view.eye[1]") > eye[1]
@@ -256,7 +287,7 @@ def test_a_setting_changes_the_run_and_the_picture_and_a_group_is_reset(page, ru
     page.get_by_label("Colour", exact=True).select_option("classification")
     holds(page, lambda: run.settings["render.colour"] == "classification")
     until(page, "splatpipe.settings['render.colour'] == 'classification'")
-    holds(page, lambda: np.mean(np.any(pixels(page) != before, axis=2)) > 0.1)
+    holds(page, lambda: changed_share(page, before) > 0.1)
     page.locator("summary", has_text="Filter").click()
     page.get_by_role("checkbox", name="water").uncheck()
     holds(page, lambda: run.settings["filter.classes"] == [2, 5, 6])
@@ -357,10 +388,16 @@ def test_the_monitor_shows_ranks_against_the_model_and_what_is_left_out(page, ru
 
 
 def test_it_comes_back_by_itself_after_a_loss(page, run, hub):
+    page.evaluate("""{
+        window.seen = [];
+        const text = id => document.getElementById(id).textContent;
+        splatpipe.connection.addEventListener('state', () =>
+            seen.push([splatpipe.connection.state.name, text('notice-title'), text('state-text')]));
+    }""")
     for viewer in list(hub._board._viewers.values()):
         hub._loop.call_soon_threadsafe(hub._board.leave, viewer, "takes nothing")
-    page.get_by_text("Connection lost").wait_for()
-    assert page.locator("#state").inner_text().startswith("reconnecting")
+    until(page, "seen.length > 0")
+    assert page.evaluate("seen[0]") == ["waiting", "Connection lost", "reconnecting in 1 s"]
     run.link.send({"kind": "settings", "settings": {**run.settings, "camera.width": 640}})
     run.settings["camera.width"] = 640
     until(page, "splatpipe.connection.state.name == 'open'")
@@ -413,23 +450,24 @@ def test_phones_get_sheets_and_fingers(visit, hub, run, width):
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_text_has_contrast(visit, hub, run, scheme):
-    page = visit(hub.url, color_scheme=scheme)
-    colours = page.evaluate("""() => ['--text', '--muted', '--accent', '--surface', '--raised', '--on-accent', '--tint'].map(name => {
-        const probe = document.createElement('i'); probe.style.color = `var(${name})`; document.body.append(probe);
-        const found = getComputedStyle(probe).color.match(/[0-9.]+/g).slice(0, 3).map(Number); probe.remove(); return found; })""")
+def test_text_has_contrast(modules, scheme):
+    modules.emulate_media(color_scheme=scheme)
+    colours = modules.evaluate(COLOURS)
     text, muted, accent, surface, raised, on_accent, tint = (_luminance(colour) for colour in colours)
-    pairs = [
-        (text, surface),
-        (muted, surface),
-        (accent, surface),
-        (text, raised),
-        (muted, raised),
-        (on_accent, accent),
-        (accent, tint),
-    ]
-    for one, two in pairs:
+    pairs = [(text, surface), (muted, surface), (accent, surface), (text, raised), (muted, raised)]
+    for one, two in [*pairs, (on_accent, accent), (accent, tint)]:
         assert (max(one, two) + 0.05) / (min(one, two) + 0.05) >= 4.5
+    assert (surface > text) == (scheme == "light")
+
+
+COLOURS = """['--text', '--muted', '--accent', '--surface', '--raised', '--on-accent', '--tint'].map(name => {
+    const probe = document.createElement('i');
+    probe.style.color = `var(${name})`;
+    document.body.append(probe);
+    const found = getComputedStyle(probe).color.match(/[0-9.]+/g).slice(0, 3).map(Number);
+    probe.remove();
+    return found;
+})"""
 
 
 def _luminance(rgb: list[float]) -> float:
@@ -443,6 +481,63 @@ def test_it_says_so_when_the_run_has_ended(visit, tmp_path):
         hub.close()
         page.get_by_text("The run has ended").wait_for()
     assert page.locator("#state").inner_text() == "ended"
+
+
+@pytest.mark.mpi
+def test_the_page_before_three_ranks(visit, tmp_path):
+    scene = tmp_path / "town.scene"
+    build_scene([CityScan(n_points=50_000)], scene, settings=BuildSettings(points_per_cell=1000))
+    config = tmp_path / "view.toml"
+    config.write_text(
+        f'[scene]\npath = "{scene}"\n[camera]\nwidth = 320\nheight = 200\n'
+        '[render]\nrasterizer = "cpu"\npoint_size_px = 2\nthreads = 1\n[pipeline]\ntopology = "pipelined"\n'
+    )
+    command = [
+        sys.executable,
+        "-m",
+        "splatpipe.cluster",
+        "view",
+        str(config),
+        "--connection",
+        str(tmp_path / "live.json"),
+    ]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+    ) as process:
+        try:
+            assert process.stdout
+            said: list[str] = []
+            while not (url := re.search(r"http://\S+", said[-1] if said else "")):
+                said.append(process.stdout.readline())
+                assert said[-1], "".join(said)
+            page = visit(url[0], start_s=90)
+            before = pixels(page)
+            assert before.shape == (HEIGHT, WIDTH, 3)
+            drag(page, (350, 240), (450, 260))
+            at_rest(page)
+            turned = pixels(page)
+            assert changed_share(page, before) > 0.05
+            page.get_by_label("Colour", exact=True).select_option("elevation")
+            until(page, "splatpipe.settings['render.colour'] == 'elevation'")
+            at_rest(page)
+            holds(page, lambda: changed_share(page, turned) > 0.05)
+            page.locator("#set-render-point_size_px").fill("99")
+            page.locator("#set-render-point_size_px").press("Enter")
+            page.get_by_text("render.point_size_px: found 99").wait_for()
+            page.keyboard.press("Tab")
+            page.keyboard.press("x")
+            page.get_by_label("Width in pixels").fill("640")
+            page.get_by_label("Height in pixels").fill("480")
+            with page.expect_download() as waiting:
+                page.get_by_role("button", name="Save picture").click()
+            with Image.open(waiting.value.path()) as image:
+                assert image.size == (640, 480)
+            process.send_signal(signal.SIGINT)
+            page.get_by_text("The run has ended").wait_for()
+            assert process.wait(30) == 0
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)  # with the ranks, where the test has failed
 
 
 def test_nothing_in_the_page_is_inline_or_from_elsewhere():
@@ -496,6 +591,40 @@ MATH = """async ([up, lower, upper]) => {
   found.top = c.dot(Object.fromEntries(tops).top, basis.u);
   return found;
 }"""
+
+
+def test_a_path_is_played_as_run_draws_it(modules):
+    rng = np.random.default_rng(3)
+    base = np.array([6.4e6, 1e5, 0.0])
+    times = [0.0, 0.7, 1.0, 2.5, 2.6, 4.0]
+    eyes, targets = base + rng.normal(0, 50, (6, 3)) + [0, -200, 80], base + rng.normal(0, 10, (6, 3))
+    eyes[3], targets[3] = eyes[2], targets[2]  # where it rests
+    degrees = [40, 50, 60, 60, 45, 30]
+    keys = [
+        {"time": t, "view": {"eye": eye.tolist(), "target": target.tolist(), "up": [0, 0, 1], "fov_deg": fov}}
+        for t, eye, target, fov in zip(times, eyes, targets, degrees, strict=True)
+    ]
+    asked = np.linspace(-0.5, 4.5, 41)
+    views = modules.evaluate(
+        """async ([keys, times]) => {
+            const c = await import('/camera.js');
+            const basis = c.basisOf('z');
+            const path = c.pathThrough(keys.map(({ time, view }) => ({ time, camera: c.cameraOf(view, basis, 300) })));
+            return times.map(time => c.viewOf(path(time)));
+        }""",
+        [keys, asked.tolist()],
+    )
+    path = KeyframePath(
+        tuple(Key(t, e, g, np.radians(f)) for t, e, g, f in zip(times, eyes, targets, degrees, strict=True)),
+        np.array([0.0, 0.0, 1.0]),
+    )
+    for at, view in zip(asked, views, strict=True):
+        pose = path.pose(at)
+        axis = np.subtract(view["target"], view["eye"])
+        assert view["eye"] == pytest.approx(pose[:3, 3], rel=0, abs=1e-6)
+        assert axis / np.linalg.norm(axis) == pytest.approx(-pose[:3, 2], abs=1e-8)
+        assert view["up"] == pytest.approx(pose[:3, 1], abs=1e-8)
+        assert view["fov_deg"] == pytest.approx(np.degrees(path.fov_y_rad(at)))
 
 
 @pytest.mark.parametrize(

@@ -186,19 +186,6 @@ def test_no_setting_names_a_file_a_rank_or_memory():
     assert set(settings_of(RunConfig())) == set(SETTABLE)
 
 
-def test_screenshots_without_end_stop_nobodys_pictures():
-    made = steering(viewers=1, fps=10.0)
-    drawn(made, 0.0)
-    uses = []
-    for i in range(8):
-        now = 1.0 + 0.06 * i
-        made.looked(THERE, True, now, 1, now)
-        while made.shoot({"viewer": 2, "request": i, "width": 64, "height": 64}):
-            pass
-        uses.append(made.next(now).use)
-    assert uses[:4] == [Use.SCREENSHOT, Use.MOVING, Use.SCREENSHOT, Use.MOVING]
-
-
 def test_a_view_has_coordinates_of_which_a_camera_of_any_size_can_be_made():
     for wrong in (1e300, -1e16, float("inf"), float("nan")):
         with pytest.raises(ValueError, match="eye"):

@@ -171,7 +171,7 @@ def test_gains_are_counts_times_unit_costs(config):
     job = job_of(config, "render.colour=#ff8000")
     work = Workload.of_look(job)
     found = {item["what"]: item for item in left_out(job, work, Decision("single", "so"))}
-    assert found["compositing"]["gain"] == 96 * 64 * 8
+    assert found["compositing"]["gain"] == pytest.approx(1e-6 * 96 * 64 * 8)
     assert found[named.COLOUR]["gain"] == pytest.approx(4e-6 * job.scene.info.n_stored)
     assert found["attributes intensity"]["gain"] == pytest.approx(4e-6 * job.scene.info.n_stored)
     assert all(item["gain"] is None or item["gain"] > 0 for item in found.values())

@@ -9,10 +9,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from ...nodes.raster import MAX_SIDE_PX
 from ...shared.config import LiveSection, RunConfig
 from ...shared.errors import SplatpipeError
 from ...shared.messages import FrameStart, Kind, Use
+from ...shared.store import Scene
 from ...shared.windows import tiles
 from ..layout import Layout, Plan
 from .protocol import LiveMessage, View
@@ -34,6 +37,7 @@ _IDLE_S = 0.25
 _LATENCIES = 256
 _MAX_WHY = 400
 """Characters of a refusal, since a message may quote what a viewer has said."""
+_MAX_LOOKED_AT = 1 << 26
 
 
 class LiveCoordinator:
@@ -67,6 +71,7 @@ class LiveCoordinator:
             "upper": list(info.upper),
             "up": job.views.path.up.tolist(),
             "attributes": sorted(info.attributes),
+            "classes": _classes(job.scene),
             "topology": job.config.pipeline.topology,
             "rasterizer": job.rasterizer,
             "ranks": ranks,
@@ -125,7 +130,8 @@ class LiveCoordinator:
             try:
                 self._start(wanted)
             except SplatpipeError as error:
-                self._refuse({"kind": "screenshot", "viewer": wanted.viewer, **(wanted.screenshot or {})}, str(error))
+                said = {"kind": "screenshot", **wanted.screenshot} if wanted.screenshot else {"kind": "camera"}
+                self._refuse({"viewer": wanted.viewer, **said}, str(error))
 
     def _start(self, wanted: Wanted) -> None:
         """Begin a picture. Raises ConfigError, InputError where it cannot be had; nothing has then been begun.
@@ -246,6 +252,16 @@ class LiveCoordinator:
 
     def _quit(self) -> None:
         self._over = True
+
+
+def _classes(scene: Scene) -> list[int]:
+    """Codes of classes that points of a scene have; none where there are too many points to look at.
+
+    Cost: one read of a byte a point.
+    """
+    if "classification" not in scene.info.attributes or scene.info.n_stored > _MAX_LOOKED_AT:
+        return []
+    return np.flatnonzero(np.bincount(scene.attribute("classification"), minlength=1)).tolist()
 
 
 def _usable(view: View) -> View:

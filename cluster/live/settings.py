@@ -48,10 +48,10 @@ SETTABLE: dict[str, dict[str, Any]] = {
     "render.background": {"type": "colour", "label": "Background", "unit": ""},
     "render.supersampling": {"type": "integer", "least": 1, "most": 4, "label": "Supersampling", "unit": "×"},
     "render.edl_strength": {"type": "number", "least": 0, "most": 4, "label": "Eye-dome lighting", "unit": ""},
-    "render.edl_radius_px": {"type": "number", "least": 0.5, "most": 8, "label": "Its radius", **_PX},
+    "render.edl_radius_px": {"type": "number", "least": 0.5, "most": 8, "label": "Lighting radius", **_PX},
     "filter.classes": {"type": "classes", "label": "Classes", "unit": ""},
     "filter.boxes": {"type": "boxes", "label": "Clip boxes", "most": 8, "unit": ""},
-    "live.fps": {"type": "number", "least": 1, "most": 60, "label": "Pictures a second to hold", "unit": "1/s"},
+    "live.fps": {"type": "number", "least": 1, "most": 60, "label": "Rate to hold", "unit": "1/s"},
 }
 """Keys, and what a page needs to offer them: a name for people, unit, bounds."""
 

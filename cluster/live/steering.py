@@ -17,7 +17,7 @@ from .protocol import View
 SCALES = (1.0, 0.84, 0.71, 0.59, 0.5, 0.42, 0.35, 0.3, 0.25, 0.21, 0.18, 0.15, 0.125, 0.1)
 """Of the sides of a picture while the camera moves: some 1.4 in pixels from one to the next."""
 MULTIPLE_PX = 8
-"""Sides of smaller pictures are multiples of this."""
+"""Widths of smaller pictures are multiples of this."""
 MAX_SCREENSHOTS = 4
 _BUSY = 0.9
 """Share of the time between two pictures that drawing one may take."""
@@ -95,7 +95,6 @@ class Steering:
     _due: Use | None = Use.STILL
     _last_s: float = -1e9
     _screenshots: deque[dict[str, Any]] = field(default_factory=deque)
-    _shot: bool = False
     _unseen: deque[tuple[int, float]] = field(default_factory=deque)
 
     def __post_init__(self) -> None:
@@ -135,17 +134,13 @@ class Steering:
             self._unseen.popleft()
 
     def next(self, now: float, room: int = 3) -> Wanted | None:
-        """The picture to begin now; None: none, or not yet (``wait_s``). room : unseen ones, at most.
-
-        A screenshot comes first, but not twice before a picture that is due: who takes many stops nobody's pictures.
-        """
-        if self._screenshots and not (self._shot and self._picture_wait_s(now, room) <= 0):
-            self._shot, shot = True, self._screenshots.popleft()
+        """The picture to begin now; None: none, or not yet (``wait_s``). room : unseen ones, at most."""
+        if self._screenshots:
+            shot = self._screenshots.popleft()
             of = {name: shot[name] for name in ("viewer", "request")}
             size = shot["width"], shot["height"]
             return Wanted(self.view, Use.SCREENSHOT, self.settings, size, 1.0, 0.0, shot["viewer"], now, None, of)
-        self._shot = False
-        if self._picture_wait_s(now, room) > 0:
+        if not self.viewers or self.wait_s(now, room) > 0:
             return None
         use = self._due or Use.STILL
         scale = self.scale.now if use is Use.MOVING else 1.0
@@ -158,9 +153,8 @@ class Steering:
 
     def wait_s(self, now: float, room: int = 3) -> float:
         """Seconds until the next picture may be begun if nobody says anything; a minute: not before somebody does."""
-        return 0.0 if self._screenshots else self._picture_wait_s(now, room)
-
-    def _picture_wait_s(self, now: float, room: int) -> float:
+        if self._screenshots:
+            return 0.0
         if not self.viewers:
             return 60.0
         while self._unseen and now - self._unseen[0][1] > _UNSEEN_S:
@@ -182,5 +176,5 @@ class Steering:
 def _sized(size: tuple[int, int], scale: float) -> tuple[int, int]:
     if scale == 1.0:
         return size
-    width, height = (max(MULTIPLE_PX, round(side * scale / MULTIPLE_PX) * MULTIPLE_PX) for side in size)
-    return min(width, size[0]), min(height, size[1])
+    width = min(max(MULTIPLE_PX, round(size[0] * scale / MULTIPLE_PX) * MULTIPLE_PX), size[0])
+    return width, max(1, round(size[1] * width / size[0]))  # the same shape: nothing jumps when the camera stands

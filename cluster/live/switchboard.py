@@ -28,12 +28,10 @@ from .protocol import (
     ViewerMessage,
     said_by_viewer,
 )
+from .screenshots import Screenshots
 from .viewers import CAMERAS_PER_S, CHANGES_PER_S, FLOOD_PER_S, HELLO_S, MESSAGES_PER_S, Outlet, Parcel, Viewer
 
 MAX_VIEWERS = 256
-MAX_SCREENSHOTS_EACH = 2
-SCREENSHOT_S = 120.0
-"""How long the hub remembers who asked for one."""
 FRAMES_KNOWN = 64
 """Pictures of which the hub still knows from where they were taken."""
 METRICS_S = 0.5
@@ -57,6 +55,7 @@ class Switchboard:
         host: str,
     ) -> None:
         self._worker = Worker(services, self._answer)
+        self._screenshots = Screenshots(to_run, self._refuse_number)
         self._to_run, self._write, self._version = to_run, write, version
         self._viewers: dict[int, Viewer] = {}
         self._numbers = 0
@@ -94,6 +93,7 @@ class Switchboard:
         """It has gone or, for a reason, goes now."""
         if self._viewers.pop(viewer.number, None) is not None:
             viewer.end(Parcel({"kind": "bye", "why": why}) if why else None)
+            self._screenshots.forget(viewer.number)
             self._count()
 
     def hear(self, viewer: Viewer, header: dict[str, Any]) -> None:
@@ -226,12 +226,7 @@ class Switchboard:
             if not self._to_run({"kind": "settings", "set": message.set, **asked}):
                 raise InputError("the run is behind; try again")
         elif isinstance(message, ScreenshotWanted):
-            if len(viewer.screenshots) >= MAX_SCREENSHOTS_EACH or message.request in viewer.screenshots:
-                raise InputError("other screenshots are still under way")
-            size = {"width": message.width, "height": message.height}
-            if not self._to_run({"kind": "screenshot", **asked, **size}):
-                raise InputError("the run is behind; try again")
-            viewer.screenshots[message.request] = time.monotonic()
+            self._screenshots.ask(viewer.number, message)
         else:
             frame = self._frames.get(getattr(message, "frame", -1), {})
             if message.kind == "pick" and "width" not in frame:
@@ -240,6 +235,11 @@ class Switchboard:
 
     def _refuse(self, viewer: Viewer, request: int, why: str) -> None:
         self._answer(viewer, Parcel({"kind": "refused", "request": request, "why": why}))
+
+    def _refuse_number(self, number: int, request: int, why: str) -> None:
+        viewer = self._viewers.get(number)
+        if viewer is not None:
+            self._refuse(viewer, request, why)
 
     def _answer(self, viewer: Viewer, parcel: Parcel) -> None:
         if not viewer.gone and not viewer.answer(parcel):
@@ -303,7 +303,7 @@ class Switchboard:
             return
         asked = started["screenshot"]
         viewer = self._viewers.get(asked["viewer"])
-        if viewer is not None and viewer.screenshots.pop(asked["request"], None) is not None:
+        if self._screenshots.done(asked["viewer"], asked["request"]) and viewer is not None:
             size = {"width": header["width"], "height": header["height"]}
             self._answer(viewer, Parcel({"kind": "screenshot", "request": asked["request"], **size}, payload))
 
@@ -315,11 +315,9 @@ class Switchboard:
                 viewer.latest(parcel)
 
     def _run_refused(self, header: dict[str, Any], payload: bytes) -> None:
-        viewer = self._viewers.get(header["viewer"])
-        if viewer is not None:
-            if header.get("of") == "screenshot":
-                viewer.screenshots.pop(header["request"], None)
-            self._refuse(viewer, header["request"], str(header["why"]))
+        if header.get("of") == "screenshot":
+            self._screenshots.done(header["viewer"], header["request"])
+        self._refuse_number(header["viewer"], header["request"], str(header["why"]))
 
     def _run_metrics(self, header: dict[str, Any], payload: bytes) -> None:
         self._gathered.take(header)
@@ -346,6 +344,7 @@ class Switchboard:
             self._look_after(viewer, now)
         self._send_camera()
         self._tell_shown()
+        self._screenshots.tick()
         self._count()
         if self._ready is not None and now - self._told_at >= METRICS_S:
             self._told_at = now
@@ -377,8 +376,6 @@ class Switchboard:
         else:
             if viewer.welcomed and now - viewer.sent_at > PROBE_S and viewer.outlet.probed:
                 viewer.latest(Parcel({"kind": "settings", "settings": self._settings}))
-            for request in [request for request, at in viewer.screenshots.items() if now - at > SCREENSHOT_S]:
-                del viewer.screenshots[request]
 
     def _sent(self) -> tuple[int, int]:
         """Pictures and bytes sent to viewers since it was asked last."""

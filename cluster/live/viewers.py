@@ -108,8 +108,6 @@ class Viewer:
         self.pictures = self.metrics = False
         self.services = 0
         """Requests of its that a service works on or has waiting."""
-        self.screenshots: dict[int, float] = {}
-        """Request → when it was made."""
         self.messages, self.cameras = Allowance(MESSAGES_PER_S), Allowance(CAMERAS_PER_S)
         self.flood, self.changes = Allowance(FLOOD_PER_S), Allowance(CHANGES_PER_S)
         self.late_camera: dict[str, Any] | None = None

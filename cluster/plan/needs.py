@@ -107,7 +107,7 @@ def _delivery(job: Job, decision: Decision) -> Part:
 
 
 def _compositing(job: Job, work: Workload, decision: Decision) -> Part:
-    sent, unit = work.pixels * FRAMEBUFFER_EMPTY.nbytes, "bytes/frame"
+    sent, unit = 1e-6 * work.pixels * FRAMEBUFFER_EMPTY.nbytes, "MB/frame"
     if decision.topology == FRAME_PARALLEL:
         return Part("compositing", True, "a picture is drawn by one rank", sent, unit, "counted")
     pipeline = job.config.pipeline

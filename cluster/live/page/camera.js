@@ -191,6 +191,51 @@ export function between(from, to, share) {
   });
 }
 
+/**
+ * The path through keys [{ time, camera }] of ascending times, as `run` draws it from keyframes: a function from a time
+ * to a camera. Where eye and target come close to each other, `run` turns more evenly than this.
+ */
+export function pathThrough(keys) {
+  const views = keys.map(({ camera }) => viewOf(camera));
+  const times = keys.map(({ time }) => time);
+  const closed = keys.length > 2 && ["eye", "target"].every((name) => String(views[0][name]) === String(views.at(-1)[name]));
+  const curve = (values) => hermite(times, values, closed);
+  const eye = curve(views.map((view) => view.eye));
+  const target = curve(views.map((view) => view.target));
+  const zoomed = curve(views.map((view) => [Math.log(tangent(view))]));
+  const { basis, size } = keys[0].camera;
+  return (time) => {
+    const fov_deg = (Math.atan(Math.exp(zoomed(time)[0])) * 360) / Math.PI;
+    return cameraOf({ eye: eye(time), target: target(time), up: basis.u, fov_deg }, basis, size);
+  };
+}
+
+/** A smooth curve through values at ascending times: the same as `shared/keyframes.py` has. */
+function hermite(times, values, closed) {
+  const n = times.length;
+  if (n === 1) return () => values[0];
+  const steps = times.slice(1).map((time, i) => time - times[i]);
+  const chords = steps.map((step, i) => values[i + 1].map((x, k) => (x - values[i][k]) / step));
+  const tangents = times.map((_, i) => {
+    const before = i > 0 ? chords[i - 1] : chords[closed ? n - 2 : 0];
+    const after = i < n - 1 ? chords[i] : chords[closed ? 0 : n - 2];
+    const [past, next] = [steps[i > 0 ? i - 1 : n - 2], steps[i < n - 1 ? i : 0]];
+    const slope = before.map((x, k) => (next * x + past * after[k]) / (past + next));
+    const most = 1.5 * Math.min(Math.hypot(...before), Math.hypot(...after)); // so that it rests between equal keys
+    const speed = Math.hypot(...slope);
+    return speed > most ? slope.map((x) => (x * most) / speed) : slope;
+  });
+  return (time) => {
+    const at = Math.min(Math.max(time, times[0]), times[n - 1]);
+    let i = 0;
+    while (i < n - 2 && times[i + 1] <= at) i++;
+    const s = (at - times[i]) / steps[i];
+    const weights = [(1 + 2 * s) * (1 - s) ** 2, s * (1 - s) ** 2 * steps[i], s * s * (3 - 2 * s), -s * s * (1 - s) * steps[i]];
+    return values[i].map((x, k) =>
+      weights[0] * x + weights[1] * tangents[i][k] + weights[2] * values[i + 1][k] + weights[3] * tangents[i + 1][k]);
+  };
+}
+
 /** Azimuth and elevation of the views along the axes. */
 export const AXIS_VIEWS = {
   top: [-Math.PI / 2, POLE],

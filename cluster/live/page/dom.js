@@ -134,6 +134,7 @@ export const ms = (value) => `${value.toFixed(value < 10 ? 2 : value < 100 ? 1 :
 export function metric(name, value) {
   if (!Number.isFinite(value)) return "–";
   if (name.endsWith("_ms")) return ms(value);
+  if (name === "cpu") return value.toFixed(2);
   if (name.endsWith("bytes_per_s")) return `${short(value)}B/s`.replace(/(\d)B/, "$1 B");
   if (name.endsWith("bytes")) return `${short(value)}B`.replace(/(\d)B/, "$1 B");
   if (name.endsWith("per_s")) return `${digits(value)} /s`;

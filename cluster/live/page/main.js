@@ -12,6 +12,7 @@ import { Picture } from "./picture.js";
 import { MeasureTool, PickTool, ScreenshotTool } from "./tools.js";
 
 const RESIZE_MS = 200;
+const CAMERA_MS = 12; // between two cameras, however fast the screen is: the hub takes 200 messages a second
 const KEPT_TIMES = 512; // of cameras sent
 const FOLLOW_MS = 400; // after the last own camera, others may steer
 const PICK_S = 10;
@@ -50,6 +51,7 @@ let tool = null;
 const sent = new Set(); // t of cameras of which no picture has been shown
 let unsent = null; // moving, of a camera that waits for the next animation frame
 let lastSteer = -Infinity;
+let lastSent = -Infinity;
 
 function steer(next, moving) {
   if (!run) return;
@@ -61,8 +63,9 @@ function steer(next, moving) {
 }
 
 function sendCamera() {
-  if (unsent === null) return;
   const t = performance.now();
+  if (unsent === null || (unsent && t - lastSent < CAMERA_MS)) return;
+  lastSent = t;
   if (connection.send({ kind: "camera", view: cameras.viewOf(camera), moving: unsent, t })) {
     sent.add(t);
     if (sent.size > KEPT_TIMES) sent.delete(sent.values().next().value);
@@ -199,15 +202,19 @@ function welcomed(header) {
   app.run = run;
   app.unit = run.units === undefined ? "m" : run.units || "units";
   settings = header.settings ?? {};
-  camera = cameras.cameraOf(header.view, cameras.basisOf(run.up), size);
-  if (homeOf !== run.scene) [home, homeOf] = [camera, run.scene];
+  if (homeOf !== run.scene) { // after a loss the camera stays, or follows the picture
+    camera = home = cameras.cameraOf(header.view, cameras.basisOf(run.up), size);
+    homeOf = run.scene;
+  }
   picture.restart();
   monitor.restart();
   sent.clear();
-  $("scene-name").textContent = run.scene;
-  $("scene-name").title = run.scene;
+  const name = run.scene.replace(/\.scene$/, "");
+  $("scene-name").textContent = name;
+  $("scene-name").title = name;
   $("scene-points").textContent = `${short(run.points)} points`;
-  document.title = `${run.scene} – splatpipe`;
+  document.title = `${name} – splatpipe`;
+  document.body.classList.remove("empty");
   panel.build(run, run.choices, settings, { Picture: [sizeChoice()] });
   for (const each of Object.values(tools)) each.show?.({});
   claimSize();
@@ -254,9 +261,9 @@ function notice() {
   const { name, why } = connection.state;
   const texts = {
     connecting: ["Connecting…", ""],
-    waiting: connection.everOpen ? ["Connection lost", `${why ? `${why}. ` : ""}It comes back by itself.`]
+    waiting: connection.everOpen ? ["Connection lost", `${why ? `The hub said: “${why}”. ` : ""}It comes back by itself.`]
       : ["No connection", "The run does not answer, or the token in the address is not its own."],
-    ended: ["The run has ended", why],
+    ended: ["The run has ended", [why === "the run is over" ? "" : `${why}.`, picture.shown ? "This is its last picture." : ""].join(" ")],
     open: ["Waiting for the first picture…", ""],
   };
   const settled = name === "open" ? picture.shown !== null : name === "connecting" && connection.everOpen;
@@ -344,7 +351,7 @@ const panelButtons = {
 const views = iconButton("views", "Views from the axes", () => {}, "1–6");
 views.setAttribute("popovertarget", "views-menu");
 const AXES = ["top", "front", "right", "bottom", "back", "left"];
-$("views-menu").append(...AXES.map((name, i) => h("button", { type: "button", role: "menuitem", onclick: () => {
+$("views-menu").append(...AXES.map((name, i) => h("button", { type: "button", onclick: () => {
   $("views-menu").hidePopover();
   axisView(name);
 } }, h("span", {}, name[0].toUpperCase() + name.slice(1)), h("kbd", {}, i + 1))));
@@ -384,8 +391,11 @@ addEventListener("keydown", (event) => {
   if (event.key === "Tab") root.dataset.tabbed = "";
   if (event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]")) return;
   const { target, key } = event;
-  if (target.matches?.("input:not([type=checkbox], [type=range]), select")) return;
-  if (target.matches?.("[type=range], [role=menuitem]") && key.startsWith("Arrow")) return;
+  if (target.matches?.("input:not([type=checkbox], [type=range]), select")) {
+    if (key === "Escape") $("scene").focus();
+    return;
+  }
+  if (target.matches?.("[type=range]") && key.startsWith("Arrow")) return;
   const does = KEYS[key.toLowerCase()];
   if (controls.key(event)) event.preventDefault();
   else if (does && !event.repeat) {
@@ -413,6 +423,7 @@ window.splatpipe = {
   connection, picture, controls, panel, cameras, latencies,
   get camera() { return camera; },
   set camera(next) { steer(next, true); },
+  get unsent() { return unsent !== null; },
   get run() { return run; },
   get settings() { return settings; },
 };

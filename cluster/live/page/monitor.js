@@ -18,20 +18,21 @@ export class Monitor {
   #latest = new Map(); // rank → { rank, role, host, values }
   #expected = new Map(); // rank → values
   #parts = []; // of the last pictures that answered a motion: { part: ms }
-  #chosen;
+  #drawn = new Map(); // key → { element, draw(series) }
+  #chosen = null; // keys of series; null: nobody has chosen yet
 
   constructor(connection) {
     this.connection = connection;
     try {
-      this.#chosen = JSON.parse(localStorage.getItem("charts")) ?? [];
+      this.#chosen = JSON.parse(localStorage.getItem("charts"));
     } catch {
-      this.#chosen = [];
+      // of another version: as if there were none
     }
     this.ranks = $("ranks");
     this.charts = $("charts");
     this.choice = $("chart-choice");
     this.choice.addEventListener("change", () => {
-      this.#choose([...this.#chosen, this.choice.value]);
+      this.#choose([...this.#charted, this.choice.value]);
       this.choice.value = "";
     });
     $("left-out").addEventListener("click", () => this.#leftOut());
@@ -54,7 +55,8 @@ export class Monitor {
 
   received({ t, ranks }) {
     for (const rank of ranks ?? []) {
-      if (this.#latest.size < 4096 || this.#latest.has(rank.rank)) this.#latest.set(rank.rank, rank);
+      const known = this.#latest.get(rank.rank);
+      if (known || this.#latest.size < 4096) this.#latest.set(rank.rank, { ...rank, stages: stagesOf(rank.values) ?? known?.stages });
       for (const [name, value] of Object.entries(rank.values ?? {})) {
         const key = `${rank.rank} ${name}`;
         let series = this.#series.get(key);
@@ -98,8 +100,8 @@ export class Monitor {
   draw() {
     if (this.ranks.closest("[hidden]")) return;
     this.#pictureParts();
-    const ranks = [...this.#latest.values()].sort((p, q) => p.rank - q.rank);
-    const times = ranks.map(({ rank, values }) => stages(values, this.#expected.get(rank)));
+    const ranks = [...this.#latest.values()].sort((p, q) => (p.rank < 0) - (q.rank < 0) || p.rank - q.rank);
+    const times = ranks.map(({ rank, stages }) => joined(stages, this.#expected.get(rank)));
     const most = Math.max(1, ...times.flat().map((s) => Math.max((s.work ?? 0) + s.wait, s.expected ?? 0)));
     $("monitor-empty").hidden = ranks.length > 0;
     this.ranks.replaceChildren(...ranks.map((rank, i) => this.#rank(rank, times[i], most)));
@@ -120,7 +122,8 @@ export class Monitor {
     });
     const shown = FIGURES.filter((key) => Number.isFinite(values?.[key]));
     const figures = shown.map((key) => h("span", { class: "stat" }, h("span", { class: "unit" }, WORDS[key] ?? key.replaceAll("_", " ")), metric(key, values[key])));
-    return h("section", { class: "rank", "aria-label": name },
+    const rests = rank >= 0 && !stagesOf(values); // no frames of late: the bars show the last ones
+    return h("section", { class: `rank ${rests ? "rests" : ""}`, "aria-label": name },
       h("h3", {}, name, h("span", { class: "unit" }, ` ${[rank < 0 ? "" : role, host].filter(Boolean).join(" · ")}`)),
       bars, h("div", { class: "stats" }, figures));
   }
@@ -133,10 +136,13 @@ export class Monitor {
     const groups = Map.groupBy ? Map.groupBy(keys, (key) => key.split(" ")[0]) : new Map([["", keys]]);
     this.choice.replaceChildren(h("option", { value: "" }, "Add a chart…"), ...[...groups].map(([rank, names]) =>
       h("optgroup", { label: rank === "-1" ? "hub" : `rank ${rank}` }, names.map((key) => h("option", { value: key }, key.slice(rank.length + 1))))));
-    if (!this.#chosen.length) {
-      const first = ["frames_per_s", "render.work_ms"].map((name) => keys.find((key) => key.endsWith(` ${name}`)));
-      this.#chosen = first.filter(Boolean);
-    }
+  }
+
+  /** Keys of the series that have charts. */
+  get #charted() {
+    if (Array.isArray(this.#chosen)) return this.#chosen;
+    const keys = [...this.#series.keys()];
+    return ["frames_per_s", "render.work_ms"].map((name) => keys.find((key) => key.endsWith(` ${name}`))).filter(Boolean);
   }
 
   #choose(keys) {
@@ -145,25 +151,42 @@ export class Monitor {
     this.draw();
   }
 
+  /** Charts stay in the page while their series grow, so that who is at a button of theirs is not thrown off it. */
   #charts() {
-    this.charts.replaceChildren(...this.#chosen.map((key) => {
-      const [rank, name] = key.split(" ");
-      const series = this.#series.get(key) ?? [];
+    const wanted = this.#charted;
+    for (const [key, chart] of this.#drawn) {
+      if (wanted.includes(key)) continue;
+      chart.element.remove();
+      this.#drawn.delete(key);
+    }
+    for (const key of wanted) {
+      if (!this.#drawn.has(key)) this.#drawn.set(key, this.#chart(key));
+      const chart = this.#drawn.get(key);
+      if (!chart.element.isConnected) this.charts.append(chart.element);
+      chart.draw(this.#series.get(key) ?? []);
+    }
+  }
+
+  #chart(key) {
+    const [rank, name] = key.split(" ");
+    const line = svg("polyline");
+    const picture = svg("svg", { viewBox: "0 0 240 40", preserveAspectRatio: "none", role: "img" });
+    picture.append(line);
+    const now = h("span", { class: "now" });
+    const element = h("div", { class: "chart" },
+      h("div", { class: "chart-head" }, h("span", {}, name, h("span", { class: "unit" }, rank === "-1" ? " hub" : ` rank ${rank}`)), now,
+        iconButton("close", `Remove the chart of ${name}`, () => this.#choose(this.#charted.filter((k) => k !== key)))),
+      picture);
+    const draw = (series) => {
       const values = series.map(([, value]) => value);
-      const [least, most] = [Math.min(...values, Infinity), Math.max(...values, -Infinity)];
-      const picture = svg("svg", { viewBox: "0 0 240 40", preserveAspectRatio: "none", role: "img",
-        "aria-label": values.length ? `${name}, from ${metric(name, least)} to ${metric(name, most)}` : `${name}, nothing yet` });
-      if (values.length > 1) {
-        const end = series.at(-1)[0];
-        const place = ([t, value]) => `${(240 - ((end - t) / HISTORY_S) * 240).toFixed(1)} ${(37 - (34 * (value - least)) / (most - least || 1)).toFixed(1)}`;
-        picture.append(svg("polyline", { points: series.map(place).join(" ") }));
-      }
-      return h("div", { class: "chart" },
-        h("div", { class: "chart-head" }, h("span", {}, name, h("span", { class: "unit" }, rank === "-1" ? " hub" : ` rank ${rank}`)),
-          h("span", { class: "now" }, metric(name, values.at(-1))),
-          iconButton("close", `Remove the chart of ${name}`, () => this.#choose(this.#chosen.filter((k) => k !== key)))),
-        picture);
-    }));
+      const [least, most] = [Math.min(...values), Math.max(...values)];
+      const end = series.at(-1)?.[0];
+      const place = ([t, value]) => `${(240 - ((end - t) / HISTORY_S) * 240).toFixed(1)} ${(37 - (34 * (value - least)) / (most - least || 1)).toFixed(1)}`;
+      line.setAttribute("points", series.map(place).join(" "));
+      now.textContent = metric(name, values.at(-1));
+      picture.setAttribute("aria-label", values.length ? `${name}, from ${metric(name, least)} to ${metric(name, most)}` : `${name}, nothing yet`);
+    };
+    return { element, draw };
   }
 
   async #leftOut() {
@@ -183,14 +206,20 @@ export class Monitor {
   }
 }
 
-/** [{ stage, work, wait, expected }], ms, of a rank's values; expected: the model's, work and what it says of waiting. */
-function stages(values = {}, expected = {}) {
-  const names = Object.keys({ ...values, ...expected }).filter((name) => name.endsWith(".work_ms")).map((name) => name.slice(0, -8));
-  const finite = (x) => (Number.isFinite(x) ? x : undefined);
-  return [...new Set(names)].map((stage) => ({
+/** stage → { work, wait }, ms, of a rank's values; null where it has done no frame. */
+function stagesOf(values = {}) {
+  const names = Object.keys(values).filter((name) => name.endsWith(".work_ms")).map((name) => name.slice(0, -8));
+  if (!names.length) return null;
+  return Object.fromEntries(names.map((stage) => [stage, { work: values[`${stage}.work_ms`], wait: values[`${stage}.wait_ms`] ?? 0 }]));
+}
+
+/** [{ stage, work, wait, expected }], ms: what is measured beside what the model expects. */
+function joined(stages, expected = {}) {
+  const modelled = stagesOf(expected) ?? {};
+  return Object.keys({ ...stages, ...modelled }).map((stage) => ({
     stage,
-    work: finite(values[`${stage}.work_ms`]),
-    wait: finite(values[`${stage}.wait_ms`]) ?? 0,
-    expected: finite(expected[`${stage}.work_ms`]),
+    work: stages?.[stage]?.work,
+    wait: stages?.[stage]?.wait ?? 0,
+    expected: modelled[stage]?.work,
   }));
 }

@@ -1,6 +1,6 @@
 // The settings: controls made from what the hub offers (`welcome.choices`), in groups that people know.
 
-import { h, iconButton, digits } from "./dom.js";
+import { h, iconButton } from "./dom.js";
 
 const DELAY_MS = 60;
 const FORGET_MS = 2000;
@@ -87,20 +87,21 @@ export class Panel {
     this.#showAll();
   }
 
-  /** Change settings: after a moment in which more may come, or at once. */
+  /** Change settings: together with what else comes within a moment, or at once. */
   want(set, now = false) {
     for (const [key, value] of Object.entries(set)) {
       this.#unsent[key] = value;
       if (value !== null) this.#wanted[key] = { value, time: performance.now() };
       else delete this.#wanted[key];
     }
-    clearTimeout(this.#timer);
-    this.#timer = setTimeout(() => this.#flush(), now ? 0 : DELAY_MS);
+    if (now) clearTimeout(this.#timer);
+    if (now || !this.#timer) this.#timer = setTimeout(() => this.#flush(), now ? 0 : DELAY_MS);
   }
 
   #flush() {
     const set = this.#unsent;
     this.#unsent = {};
+    this.#timer = 0;
     const back = () => {
       for (const key of Object.keys(set)) {
         delete this.#wanted[key];
@@ -287,7 +288,7 @@ function classes(of) {
   };
   const all = h("button", { type: "button", class: "quiet", onclick: () => set([]) }, "all");
   return {
-    element: h("fieldset", { class: "classes" }, h("legend", {}, h("span", {}, of.label), all), lines),
+    element: h("fieldset", { class: "classes" }, h("legend", {}, h("span", {}, of.label), all), h("div", { class: "class-list" }, lines)),
     show,
   };
 }
@@ -313,7 +314,8 @@ function boxes(of) {
     keep: keep.value,
   });
   const label = () => sliders.forEach(([p, q], k) => {
-    outputs[k].textContent = `${digits(at(k, p.value / 1000))} – ${digits(at(k, q.value / 1000))}`;
+    const places = Math.max(0, Math.min(12, 4 - Math.ceil(Math.log10(upper[k] - lower[k] || 1))));
+    outputs[k].textContent = [p, q].map((s) => at(k, s.value / 1000).toFixed(places)).join(" – ");
   });
   const changed = () => {
     details.hidden = !on.checked;

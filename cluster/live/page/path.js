@@ -1,6 +1,6 @@
 // Recording a camera path: keys by hand or sampled from the motion, playing them, and saving them as TOML.
 
-import { between, viewOf } from "./camera.js";
+import { pathThrough, viewOf } from "./camera.js";
 import { download, h, icon, iconButton, toast } from "./dom.js";
 
 const MAX_KEYS = 240; // a message with all of them stays below the protocol's 64 KiB
@@ -76,17 +76,13 @@ export class PathTool {
   preview() {
     const { controls } = this.app;
     if (this.playing) return controls.halt();
-    const keys = this.keys.map(({ time, camera }) => ({ time: time - this.keys[0].time, camera }));
+    const keys = this.keys.filter((key, i) => key.time !== this.keys[i + 1]?.time);
+    const path = pathThrough(keys);
     this.playing = true;
     this.show();
     controls.play((passed_ms) => {
-      const time = passed_ms / 1000;
-      const next = keys.findIndex((key) => key.time > time);
-      if (next > 0) {
-        const [from, to] = [keys[next - 1], keys[next]];
-        return between(from.camera, to.camera, (time - from.time) / (to.time - from.time));
-      }
-      return null;
+      const time = keys[0].time + passed_ms / 1000;
+      return time < keys.at(-1).time ? path(time) : null;
     }, () => this.stopped());
   }
 

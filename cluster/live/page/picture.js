@@ -1,5 +1,6 @@
 // The picture on the canvas: decoding, order, where it lies in the window, and the size that the run is asked for.
 
+const MULTIPLE = 8; // of the sides asked for
 const ALIKE = 0.03; // shapes that differ by less are filled by cutting, others by bars
 
 export class Picture {
@@ -46,23 +47,29 @@ export class Picture {
     return width / Math.max(1, height);
   }
 
+  /**
+   * How the picture lies in the window, a value of CSS's object-fit. none: pixel by pixel, a few at the borders unseen;
+   * cover: it fills the window, and a little is cut off; contain: all of it, with bars.
+   */
+  get #fit() {
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    const over = this.shown ? [this.shown.width - width, this.shown.height - height] : [0, 0];
+    if (devicePixelRatio === 1 && over.every((x) => x >= 0 && x < MULTIPLE)) return "none";
+    return Math.abs(Math.log((this.aspect * height) / Math.max(1, width))) < ALIKE ? "cover" : "contain";
+  }
+
   /** { left, top, width, height } of the whole picture, CSS pixels of the window. */
   get place_px() {
     const { clientWidth: width, clientHeight: height } = this.canvas;
-    const fits = this.aspect > width / height;
-    const scale = fits === this.cut ? height : width / this.aspect;
-    const size = { width: scale * this.aspect, height: scale };
+    const fit = this.#fit;
+    const wider = this.aspect > width / height;
+    const tall = fit === "none" && this.shown ? this.shown.height : wider === (fit === "cover") ? height : width / this.aspect;
+    const size = { width: tall * this.aspect, height: tall };
     return { left: (width - size.width) / 2, top: (height - size.height) / 2, ...size };
   }
 
-  /** Whether the picture is cut a little to fill the window, in place of bars beside it. */
-  get cut() {
-    const window_aspect = this.canvas.clientWidth / Math.max(1, this.canvas.clientHeight);
-    return Math.abs(Math.log(this.aspect / window_aspect)) < ALIKE;
-  }
-
   place() {
-    this.canvas.classList.toggle("cut", this.cut);
+    this.canvas.dataset.fit = this.#fit;
   }
 
   /** Shares of the picture of a place in the window. */
@@ -84,6 +91,6 @@ export class Picture {
     const height = this.canvas.clientHeight * density;
     const shortest = (longest * 5) / 8;
     const scale = Math.min(1, longest / Math.max(width, height), shortest / Math.min(width, height));
-    return [width, height].map((side) => Math.max(16, Math.round((side * scale) / 8) * 8));
+    return [width, height].map((side) => Math.max(16, Math.ceil((side * scale) / MULTIPLE - 1e-6) * MULTIPLE));
   }
 }

@@ -189,7 +189,7 @@ export class ScreenshotTool {
     this.element.setAttribute("aria-busy", "true");
     try {
       const { payload } = await this.app.connection.request({ kind: "screenshot", width, height }, 300);
-      const name = fileName(this.app.run.scene, "png");
+      const name = fileName(this.app.run.scene.replace(/\.scene$/, ""), "png");
       download(name, new Blob([payload], { type: "image/png" }));
       toast(`Saved ${name}`);
     } catch (error) {
