@@ -70,7 +70,7 @@ class View(ViewerMessage):
 
     eye: Vector
     target: Vector
-    up: Vector = (0.0, 0.0, 1.0)
+    up: tuple[Finite, Finite, Finite] = (0.0, 0.0, 1.0)
     fov_deg: Annotated[float, Field(gt=0, lt=180)] = 45.0
 
 
