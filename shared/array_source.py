@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import os
 import weakref
@@ -51,10 +52,13 @@ class ArrayFiles:
 
     def load(self, name: str, mmap: bool) -> np.ndarray:
         """The array, mapped read-only from its file, or read whole."""
-        self._data_offset(name)
-        path = self._file(name)
+        begin = self._data_offset(name)
+        path, promised = self._file(name), self._info.arrays[name]
+        dtype = np.dtype(promised.dtype)
         with _reading(path):
-            return np.load(path, mmap_mode="r" if mmap else None, allow_pickle=False)
+            if mmap:
+                return np.memmap(path, dtype, "r", begin, promised.shape)
+            return np.fromfile(path, dtype, offset=begin).reshape(promised.shape)
 
     def chunks(self, name: str) -> Iterator[bytes]:
         """The bytes of the array; read, not mapped, so that a failing disk is an error and no signal."""
@@ -138,10 +142,15 @@ def data_offset(path: Path, dtype: np.dtype, shape: tuple[int, ...], whose: str 
     Raises StoreError naming what differs, or that an array of the ``whose`` is missing or cannot be read.
     """
     with _reading(path, whose), path.open("rb") as file:
-        version = np.lib.format.read_magic(file)
-        if version != (1, 0):
-            raise StoreError(f"{path}: found npy version {version}, expected (1, 0)")
-        found_shape, fortran, found = np.lib.format.read_array_header_1_0(file)
+        written = _header(dtype, shape)
+        if file.read(len(written)) == written:  # parsing it is slower, and not for two threads in Python before 3.11.8
+            found_shape, fortran, found = shape, False, dtype
+        else:
+            file.seek(0)
+            version = np.lib.format.read_magic(file)
+            if version != (1, 0):
+                raise StoreError(f"{path}: found npy version {version}, expected (1, 0)")
+            found_shape, fortran, found = np.lib.format.read_array_header_1_0(file)
         offset = file.tell()
     if (found_shape, fortran, found) != (shape, False, dtype):
         raise StoreError(f"{path}: header says {_name(found)} {found_shape}, expected {_name(dtype)} {shape}")
@@ -149,6 +158,14 @@ def data_offset(path: Path, dtype: np.dtype, shape: tuple[int, ...], whose: str 
     if size != expected:
         raise StoreError(f"{path}: found {size} bytes, expected {expected}")
     return offset
+
+
+def _header(dtype: np.dtype, shape: tuple[int, ...]) -> bytes:
+    """The first bytes of an ``.npy`` file as NumPy, and so a build, writes them."""
+    file = io.BytesIO()
+    promised = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(file, promised)
+    return file.getvalue()
 
 
 def _name(dtype: np.dtype) -> str:

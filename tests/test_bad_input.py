@@ -1,13 +1,16 @@
 """Bad input at the command line: one clear line, exit status 2, nothing written."""
 
+import io
 import json
 import subprocess
 import sys
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import laspy
 import numpy as np
 import pytest
+from splatpipe.cluster.cli import main
 from splatpipe.shared.build import build_scene
 from splatpipe.shared.synth import CityScan
 
@@ -18,6 +21,20 @@ def splatpipe(*arguments, cwd: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [*SPLATPIPE, *map(str, arguments)], capture_output=True, text=True, timeout=60, cwd=cwd, check=False
     )
+
+
+def in_process(*arguments, cwd: Path) -> subprocess.CompletedProcess[str]:
+    """The same in this process, for commands that end before they start others."""
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        redirect_stdout(io.StringIO()) as stdout,
+        redirect_stderr(io.StringIO()) as stderr,
+    ):
+        patch.chdir(cwd)
+        patch.setattr(sys, "argv", ["splatpipe", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+    return subprocess.CompletedProcess(arguments, ended.value.code, stdout.getvalue(), stderr.getvalue())
 
 
 def assert_refused(done: subprocess.CompletedProcess[str], *said: str) -> None:
@@ -85,7 +102,7 @@ KINDS += ["ply of 1e12 points", "zero points", "unknown extension"]
 def test_a_bad_file_is_refused_and_no_scene_is_left(tmp_path, kind):
     name, said = bad_file(kind, tmp_path)
     before = sorted(tmp_path.iterdir())
-    assert_refused(splatpipe("build", name, "-o", "a.scene", cwd=tmp_path), *said)
+    assert_refused(in_process("build", name, "-o", "a.scene", cwd=tmp_path), *said)
     assert sorted(tmp_path.iterdir()) == before
 
 
@@ -104,16 +121,16 @@ def test_points_that_are_not_finite_are_dropped_and_counted_or_refused(tmp_path)
 def test_a_scene_is_not_replaced_unasked_nor_by_a_build_that_fails(tmp_path):
     np.save(tmp_path / "a.npy", np.random.default_rng(1).normal(size=(100, 3)))
     (tmp_path / "bad.ply").write_bytes(ply_bytes(1000, 10))
-    assert splatpipe("build", "a.npy", "-o", "a.scene", cwd=tmp_path).returncode == 0
+    assert in_process("build", "a.npy", "-o", "a.scene", cwd=tmp_path).returncode == 0
     before = {path.name: path.read_bytes() for path in (tmp_path / "a.scene").iterdir()}
-    assert_refused(splatpipe("build", "a.npy", "-o", "a.scene", cwd=tmp_path), "a.scene", "overwrite")
-    assert_refused(splatpipe("build", "bad.ply", "-o", "a.scene", "--overwrite", cwd=tmp_path), "bad.ply")
+    assert_refused(in_process("build", "a.npy", "-o", "a.scene", cwd=tmp_path), "a.scene", "overwrite")
+    assert_refused(in_process("build", "bad.ply", "-o", "a.scene", "--overwrite", cwd=tmp_path), "bad.ply")
     assert {path.name: path.read_bytes() for path in (tmp_path / "a.scene").iterdir()} == before
 
 
 def test_an_unwritable_output_is_refused(tmp_path):
     np.save(tmp_path / "a.npy", np.random.default_rng(1).normal(size=(100, 3)))
-    assert_refused(splatpipe("build", "a.npy", "-o", "a.npy/a.scene", cwd=tmp_path), "a.npy")
+    assert_refused(in_process("build", "a.npy", "-o", "a.npy/a.scene", cwd=tmp_path), "a.npy")
 
 
 def test_a_full_disk_is_said_and_nothing_is_left(tmp_path):
@@ -142,10 +159,10 @@ def copy_of(scene: Path, folder: Path) -> Path:
     return copy
 
 
-def run(folder: Path, text: str, *settings: str) -> subprocess.CompletedProcess[str]:
+def run(folder: Path, text: str, *settings: str, call=in_process) -> subprocess.CompletedProcess[str]:
     (folder / "run.toml").write_text(text)
     sets = ["output.frames=2", "camera.width=64", "camera.height=64", *settings]
-    return splatpipe("run", "run.toml", *(part for item in sets for part in ("--set", item)), cwd=folder)
+    return call("run", "run.toml", *(part for item in sets for part in ("--set", item)), cwd=folder)
 
 
 @pytest.mark.parametrize(
@@ -193,15 +210,15 @@ def test_a_damaged_array_is_named_by_run_and_by_verify(tmp_path, city, array, to
     data = bytearray(path.read_bytes())
     data[-5] ^= 0x10
     path.write_bytes(data)
-    done = run(tmp_path, "[scene]\npath = 'copy.scene'", f"pipeline.topology={topology}")
+    done = run(tmp_path, "[scene]\npath = 'copy.scene'", f"pipeline.topology={topology}", call=splatpipe)
     assert_refused(done, f"{array}.npy", "checksum")
     assert not list((tmp_path / "frames").glob("*.png"))
-    assert_refused(splatpipe("verify", "copy.scene", cwd=tmp_path), f"{array}.npy", "checksum")
+    assert_refused(in_process("verify", "copy.scene", cwd=tmp_path), f"{array}.npy", "checksum")
 
 
 def test_bad_usage_is_refused(tmp_path):
     for arguments in (["build"], ["fly"], ["run", "--frames"], ["build", "x.las", "-o", "y", "--memory", "lots"]):
-        done = splatpipe(*arguments, cwd=tmp_path)
+        done = in_process(*arguments, cwd=tmp_path)
         assert done.returncode == 2
         assert done.stderr.strip()
     assert list(tmp_path.iterdir()) == []

@@ -96,6 +96,29 @@ def test_every_damaged_byte_of_an_array_is_found(scene):
     Scene.open(scene).verify()
 
 
+def test_headers_as_numpy_writes_them_are_not_parsed(built, monkeypatch):
+    """That takes ``ast.parse``, which may fail in two threads at once in Python before 3.11.8."""
+    monkeypatch.setattr(np.lib.format, "read_array_header_1_0", lambda _: pytest.fail("a header was parsed"))
+    monkeypatch.setattr("ast.parse", lambda *_, **__: pytest.fail("a header was parsed"))
+    scene = Scene.open(built)
+    scene.verify()
+    for mmap in (True, False):
+        assert [len(column) for column in scene.positions(mmap)] == [scene.info.n_stored] * 3
+
+
+def test_headers_written_otherwise_are_read(scene):
+    file = scene / "x.npy"
+    whole, expected = file.read_bytes(), Scene.open(scene).positions(mmap=False)[0]
+    length = int.from_bytes(whole[8:10], "little")
+    header, data = whole[10 : 10 + length], whole[10 + length :]
+    longer = header.replace(b"{'descr'", b"{ 'descr'").rstrip() + b" " * 77 + b"\n"
+    file.write_bytes(whole[:8] + len(longer).to_bytes(2, "little") + longer + data)
+    other = Scene.open(scene)
+    other.verify()
+    for mmap in (True, False):
+        assert np.array_equal(other.positions(mmap)[0], expected)
+
+
 @pytest.mark.parametrize("damage", ["short", "long", "gone", "empty", "header", "pickle"])
 def test_arrays_of_the_wrong_size_are_refused_at_once(scene, damage):
     file = scene / "x.npy"
