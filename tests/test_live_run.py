@@ -74,8 +74,9 @@ class Hub:
 
     def wait(self, wanted, after=0):
         """The first message from number ``after`` on that is wanted, and the number of the next."""
+        end = time.monotonic() + 60
         with self.there:
-            for _ in range(100):
+            while time.monotonic() < end:
                 for i, message in enumerate(self.said[after:], after):
                     if wanted(message):
                         return message, i + 1
