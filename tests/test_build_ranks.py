@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from splatpipe.cluster.build_ranks import without_ranks
 from splatpipe.cluster.launch import find_mpiexec, mpi_available
 from splatpipe.shared.build import BuildSettings, build_scene, builder, on_ranks
+from splatpipe.shared.build import settings as build_settings
 from splatpipe.shared.build.on_ranks import build_scene_on_ranks
 from splatpipe.shared.build.ranks import FailedElsewhere
 from splatpipe.shared.build.settings import MemoryPlan
@@ -36,6 +37,12 @@ from .thread_ranks import on_threads
 
 needs_mpi = pytest.mark.skipif(not mpi_available(), reason="mpi4py or mpiexec is missing: splatpipe[mpi]")
 SPLATPIPE = [sys.executable, "-m", "splatpipe.cluster"]
+
+
+@pytest.fixture(autouse=True)
+def process_of_its_own(monkeypatch):
+    """Ranks that are threads of the tests' process do not each hold what that holds, which is much by now."""
+    monkeypatch.setattr(build_settings, "resident_bytes", lambda: 200 << 20)
 
 
 class PartSource(ArraySource):
