@@ -121,6 +121,12 @@ def fail_all(transport: Any, message: str, status: int, error: BaseException) ->
     transport.abort(status)
 
 
+def fail_rank(transport: Any, role: str, error: BaseException) -> None:
+    """Say which rank failed and why, in one line, and end every rank."""
+    cause = str(error) if isinstance(error, SplatpipeError) else f"{type(error).__name__}: {error}"
+    fail_all(transport, f"rank {transport.rank} ({role}): {cause}", getattr(error, "exit_status", 1), error)
+
+
 def show_traceback(error: BaseException) -> None:
     """On standard error, with ``--debug``."""
     if "SPLATPIPE_DEBUG" in os.environ:

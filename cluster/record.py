@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..shared.messages import RenderPoints, VisibilityBits
+from ..shared.process_memory import resident_bytes
 
 if TYPE_CHECKING:
     from ..nodes.raster.paged_points import Residency
@@ -165,11 +166,6 @@ def rank_record(role: str, rank: int) -> dict[str, Any]:
         "rss_bytes": resident_bytes(),
         "peak_rss_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
     }
-
-
-def resident_bytes() -> int:
-    """Resident memory of this process now."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
 
 
 def machine_record() -> dict[str, Any]:

@@ -20,7 +20,7 @@ from .job import Job
 from .launch import (
     EXPECTED_RANKS,
     check_started,
-    fail_all,
+    fail_rank,
     inside_mpi,
     launch,
     mpi_available,
@@ -114,7 +114,7 @@ def _run_rank(config_path: Path, overrides: list[str], json_path: Path | None) -
     try:
         return survival.run(lambda: _attempt(config_path, overrides, json_path, transport, survival))
     except BaseException as error:
-        _abort(transport, "starting", error)
+        fail_rank(transport, "starting", error)
     return 1
 
 
@@ -175,7 +175,7 @@ def _attempt(
     except BaseException as error:
         if transport.survives and transport.lost_a_rank(error) and not by_messages:
             raise
-        _abort(transport, role, error)
+        fail_rank(transport, role, error)
     return 0
 
 
@@ -213,12 +213,6 @@ def _decided(pipeline: PipelineSection, ranks: int, lost: list[dict[str, Any]]) 
     if DECISION in os.environ:
         return Decision.from_json(os.environ[DECISION])
     return Decision(topology, f"started on {ranks} ranks by mpiexec")
-
-
-def _abort(transport: Any, role: str, error: BaseException) -> None:
-    """Say which rank failed and why, in one line, and end every rank."""
-    cause = str(error) if isinstance(error, SplatpipeError) else f"{type(error).__name__}: {error}"
-    fail_all(transport, f"rank {transport.rank} ({role}): {cause}", getattr(error, "exit_status", 1), error)
 
 
 def _finish(

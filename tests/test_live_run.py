@@ -209,14 +209,20 @@ def test_every_topology_draws_what_is_asked_for_with_the_bits_of_one_rank(config
     assert not [m for m in hub.said if m.kind == "refused"]
 
 
+def dragged(hub, n):
+    """The last of n moving pictures, each seen before the camera moves on, and the number of the next message."""
+    hub.tell(kind="viewers", pictures=1)
+    _, _, after = hub.still()
+    for i in range(n):
+        hub.look(VIEW | {"eye": [60.0 + i, -90.0, 70.0]}, moving=True)
+        moving, after = hub.wait(lambda m: m.kind == "picture" and m.header["encoding"] == "jpeg", after)
+        hub.tell(kind="shown", frame=moving.header["frame"])
+    return moving, after
+
+
 def test_a_moving_camera_is_followed_by_jpeg_and_then_a_whole_picture(config):
     def script(hub):
-        hub.tell(kind="viewers", pictures=1)
-        _, _, after = hub.still()
-        for i in range(20):
-            hub.look(VIEW | {"eye": [60.0 + i, -90.0, 70.0]}, moving=True)
-            moving, after = hub.wait(lambda m: m.kind == "picture" and m.header["encoding"] == "jpeg", after)
-            hub.tell(kind="shown", frame=moving.header["frame"])
+        moving, after = dragged(hub, 20)
         _, picture, _ = hub.still(after)
         assert np.array_equal(picture, reference(config, VIEW | {"eye": [79.0, -90.0, 70.0]}))
         assert moving.payload[:2] == b"\xff\xd8"
@@ -226,12 +232,7 @@ def test_a_moving_camera_is_followed_by_jpeg_and_then_a_whole_picture(config):
 
 def test_a_slow_run_draws_smaller_pictures_while_the_camera_moves(config):
     def script(hub):
-        hub.tell(kind="viewers", pictures=1)
-        _, _, after = hub.still()
-        for i in range(30):
-            hub.look(VIEW | {"eye": [60.0 + i, -90.0, 70.0]}, moving=True)
-            moving, after = hub.wait(lambda m: m.kind == "picture" and m.header["encoding"] == "jpeg", after)
-            hub.tell(kind="shown", frame=moving.header["frame"])
+        moving, after = dragged(hub, 30)
         assert (moving.header["width"], moving.header["height"]) < (163, 91)
         started, picture, _ = hub.still(after)
         assert started["scale"] == 1.0

@@ -24,13 +24,13 @@ from ...nodes.raster.cpu import CpuRasterizer
 from ...nodes.render import RenderNode, load_points
 from ...nodes.sampling import SamplingNode
 from ...shared.build import BuildSettings, build_scene
-from ...shared.build.settings import resident_bytes
 from ...shared.camera import Camera
 from ...shared.camera_path import camera_path
 from ...shared.colour import Colouring, frame_to_rgba, parse_colour
 from ...shared.config import CameraSection, Keyframe
 from ...shared.messages import RenderPoints
 from ...shared.metrics import coverage, depth_rmse, foreground, psnr_db, rmse
+from ...shared.process_memory import resident_bytes
 from ...shared.readers.source import Source
 from ...shared.store import Scene
 from ...shared.synth import CityScan

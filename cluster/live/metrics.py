@@ -11,7 +11,8 @@ import time
 from collections.abc import Callable, Iterable
 from typing import Protocol
 
-from ..record import FrameCounts, StageClock, resident_bytes
+from ...shared.process_memory import resident_bytes
+from ..record import FrameCounts, StageClock
 
 POINT_BYTES = 16
 """Of a point in a pool of pages that has a colour."""

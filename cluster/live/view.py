@@ -18,7 +18,7 @@ from ...shared.errors import ConfigError, SplatpipeError
 from ..job import Job
 from ..launch import (
     check_started,
-    fail_all,
+    fail_rank,
     inside_mpi,
     launch,
     mpi_available,
@@ -166,8 +166,7 @@ def _run_rank(config_path: Path, overrides: list[str], listening: Listening) -> 
             _run(job, transport, _address(job, transport, listening, stack))
             transport.finish()
     except BaseException as error:
-        cause = str(error) if isinstance(error, SplatpipeError) else f"{type(error).__name__}: {error}"
-        fail_all(transport, f"rank {transport.rank} ({role}): {cause}", getattr(error, "exit_status", 1), error)
+        fail_rank(transport, role, error)
     return 0
 
 

@@ -10,8 +10,9 @@ from ..codecs import streams
 from ..codecs.autocorrelation import FLOAT32_POINTS
 from ..octree import cell_centers
 from ..pooled import LEAST_POINTS, CellGrid, points_of
+from ..process_memory import resident_bytes
 from .parallel import Workers
-from .settings import BuildSettings, available_memory_bytes, resident_bytes
+from .settings import BuildSettings, available_memory_bytes
 from .shares import consecutive
 from .writer import ColumnFolder, writing
 

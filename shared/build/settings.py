@@ -12,6 +12,7 @@ from ..codecs.positions import most_position_bits
 from ..errors import InputError
 from ..octree import MAX_LEVEL
 from ..points import ATTRIBUTES
+from ..process_memory import resident_bytes
 from ..scene_info import POINT_ORDERS, POSITIONS, UP_AXES
 
 NORMALS = ("keep", "estimate")
@@ -158,14 +159,6 @@ def _own_control_groups() -> list[Path]:
         group = Path("/sys/fs/cgroup", "memory" if "memory" in controllers else "", name.lstrip("/"))
         groups += [group, *(p for p in group.parents if p.is_relative_to("/sys/fs/cgroup"))]
     return groups
-
-
-def resident_bytes() -> int:
-    """Memory the process holds now."""
-    try:
-        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    except OSError:
-        return 0
 
 
 def peak_resident_bytes() -> int:
